@@ -1,0 +1,208 @@
+"""The edges of a scene: found on the meshes welded by position, and classified by what jumps across them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from . import meshes
+from .meshes import Geometry
+
+
+class EdgeKind(IntEnum):
+    """What makes an edge a boundary of the image.
+
+    JUMP   : always: it has one face only, or more than two, or what lies on its two sides differs (shape, texture coordinates,
+             attributes).
+    FLAT   : as a silhouette, and where its faces are not coplanar: the shading normal is that of the face.
+    SPLIT  : as a silhouette, and where the vertex normals of its two sides differ.
+    SMOOTH : as a silhouette only.
+    """
+
+    JUMP = 0
+    FLAT = 1
+    SPLIT = 2
+    SMOOTH = 3
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Topology of the edges of all meshes of a scene, on the host. Positions are not stored: they change, this does not.
+
+    Vertex indices refer to `Geometry.positions`, that is, to the original vertices, not to welded ones. An edge has two sides.
+    Where exporters have split the vertices, the sides name different vertices at the same place; a side that is missing
+    (an open edge) repeats the other.
+
+    vertices : (E, 2, 2), uint32; `[e, side]` = the two end points.
+    opposite : (E, 2), uint32; the third vertex of the face on each side.
+    mesh     : (E, 2), uint32; index into `Geometry.meshes` of the face on each side.
+    kind     : (E,), uint8; an `EdgeKind`.
+    open     : (E,), bool; only one face.
+    """
+
+    vertices: np.ndarray
+    opposite: np.ndarray
+    mesh: np.ndarray
+    kind: np.ndarray
+    open: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def take(self, which: np.ndarray) -> Edges:
+        """Some of the edges, by index or by mask."""
+        return Edges(self.vertices[which], self.opposite[which], self.mesh[which], self.kind[which], self.open[which])
+
+    def of_meshes(self, wanted: np.ndarray) -> Edges:
+        """The edges that have a face in one of the meshes for which `wanted` (bool) holds."""
+        return self.take(wanted[self.mesh].any(axis=1))
+
+    def summary(self) -> dict[str, int]:
+        counts = np.bincount(self.kind, minlength=len(EdgeKind))
+        return {"edges": len(self), "open": int(self.open.sum()), **{k.name.lower(): int(counts[k]) for k in EdgeKind}}
+
+
+def find_edges(geometry: Geometry) -> Edges:
+    """Find and classify the edges of all meshes, as one welded whole.
+
+    Welding over the borders of meshes makes one edge of two that coincide, as where the walls of a room meet: sampled as two, its
+    jump would count twice. Triangles that are degenerate after welding, and repeated triangles, are ignored. A vertex that is not finite
+    raises ValueError.
+    """
+    face_list, mesh_of_face, uv, uv_offset = [], [], [], []
+    points, offset = [], 0
+    for i, mesh in enumerate(geometry.meshes):
+        f, v = meshes.faces(mesh), meshes.vertices(mesh)
+        if not np.isfinite(v).all():
+            raise ValueError(f'shape "{mesh.id()}": {int((~np.isfinite(v)).any(1).sum())} vertices are not finite')
+        face_list.append(f.astype(np.int64) + offset)
+        mesh_of_face.append(np.full(len(f), i, np.uint32))
+        points.append(v)
+        t = meshes.texture_coordinates(mesh)
+        uv.append(np.zeros((len(v), 2), np.float32) if t is None else t)
+        offset += len(v)
+    if not points:
+        return _no_edges()
+    face, mesh_of_face = np.concatenate(face_list), np.concatenate(mesh_of_face)
+    point, uv = np.concatenate(points), np.concatenate(uv)
+
+    weld = _weld_equal(point)
+    sides = _pair_sides(weld, face)
+    # Coordinates that went through different transformations differ in their last bits. Only open edges can be concerned.
+    rewelded = _weld_close(point, weld, face, sides)
+    if rewelded is not weld:
+        weld, sides = rewelded, _pair_sides(rewelded, face)
+
+    face0, corner0, face1, corner1, count = sides
+    i0, j0, o0 = _corners(face, weld, face0, corner0)
+    i1, j1, o1 = _corners(face, weld, face1, corner1)
+    mesh0, mesh1 = mesh_of_face[face0], mesh_of_face[face1]
+
+    interpolated = np.array([meshes.has_interpolated_normals(m) for m in geometry.meshes])
+    face_attributes = np.array([meshes.has_face_attributes(m) for m in geometry.meshes])
+    split = (i0 != i1) | (j0 != j1)
+    seam = split & ((uv[i0] != uv[i1]).any(1) | (uv[j0] != uv[j1]).any(1))
+
+    kind = np.full(len(face0), EdgeKind.SMOOTH, np.uint8)
+    kind[split] = EdgeKind.SPLIT
+    kind[~interpolated[mesh0]] = EdgeKind.FLAT
+    kind[(count != 2) | (mesh0 != mesh1) | seam | face_attributes[mesh0]] = EdgeKind.JUMP
+    return Edges(
+        vertices=np.stack([np.stack([i0, j0], 1), np.stack([i1, j1], 1)], 1).astype(np.uint32),
+        opposite=np.stack([o0, o1], 1).astype(np.uint32),
+        mesh=np.stack([mesh0, mesh1], 1),
+        kind=kind,
+        open=count == 1,
+    )
+
+
+def _no_edges() -> Edges:
+    return Edges(
+        np.zeros((0, 2, 2), np.uint32), np.zeros((0, 2), np.uint32), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), np.zeros(0, bool)
+    )  # fmt: skip
+
+
+def _weld_equal(point: np.ndarray) -> np.ndarray:
+    """Number the distinct positions: (V,), int64. Adding zero makes +0 and -0 the same bits."""
+    bits = (point + np.float32(0)).view(np.uint32).astype(np.uint64)
+    # Sorting one integer a row is several times faster than sorting rows: mix the three, and check below that nothing collided.
+    mixed = (
+        bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+        ^ bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F)
+        ^ bits[:, 2] * np.uint64(0x165667B19E3779F9)
+    )
+    _, first, weld = np.unique(mixed, return_index=True, return_inverse=True)
+    if not (bits[first[weld]] == bits).all():
+        _, weld = np.unique(bits, axis=0, return_inverse=True)
+    return weld.reshape(-1).astype(np.int64)
+
+
+def _mix(rows: np.ndarray) -> np.ndarray:
+    """Hash the three columns of `rows` (uint64) into one."""
+    a, b, c = rows.T
+    return (a * np.uint64(0x9E3779B97F4A7C15)) ^ (b * np.uint64(0xC2B2AE3D27D4EB4F)) ^ (c * np.uint64(0x165667B19E3779F9))
+
+
+def _weld_close(point: np.ndarray, weld: np.ndarray, face: np.ndarray, sides: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Join the welded vertices of open edges that are closer than single precision can tell apart."""
+    face0, corner0, _, _, count = sides
+    lone = count == 1
+    ends = np.concatenate([face[face0[lone], corner0[lone]], face[face0[lone], (corner0[lone] + 1) % 3]])
+    if len(ends) == 0:
+        return weld
+    _, representative = np.unique(weld[ends], return_index=True)
+    vertex = ends[representative]
+    tolerance = 8 * np.finfo(np.float32).eps * max(np.abs(point[vertex]).max(), np.finfo(np.float32).tiny)
+    pairs = cKDTree(point[vertex]).query_pairs(tolerance, output_type="ndarray")
+    if len(pairs) == 0:
+        return weld
+    a, b = weld[vertex[pairs[:, 0]]], weld[vertex[pairs[:, 1]]]
+    n = int(weld.max()) + 1
+    _, group = connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n)), directed=False)
+    return group[weld].astype(np.int64)
+
+
+def _pair_sides(weld: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, ...]:
+    """For every welded edge: face and corner of its first and second side, and the number of its faces.
+
+    Corner k of a face stands for the side from its vertex k to vertex k + 1.
+    """
+    w = weld[face]
+    alive = np.flatnonzero((w[:, 0] != w[:, 1]) & (w[:, 1] != w[:, 2]) & (w[:, 2] != w[:, 0]))
+    n = int(weld.max()) + 1 if len(weld) else 1
+    # Of triangles over the same three points, keep one.
+    s = np.sort(w[alive], axis=1)
+    order = np.argsort(_mix(s.astype(np.uint64)))
+    s = s[order]
+    repeated = np.zeros(len(s), bool)
+    repeated[1:] = (s[1:] == s[:-1]).all(1)
+    alive = np.sort(alive[order[~repeated]])
+
+    w = w[alive]
+    start, end = w.reshape(-1), np.roll(w, -1, axis=1).reshape(-1)
+    key = np.minimum(start, end) * n + np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    sorted_key = key[order]
+    first = (
+        np.flatnonzero(np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]]))
+        if len(key)
+        else np.zeros(0, np.int64)
+    )
+    count = np.diff(np.append(first, len(key)))
+    h0 = order[first]
+    h1 = order[first + np.minimum(count - 1, 1)]
+    return alive[h0 // 3], h0 % 3, alive[h1 // 3], h1 % 3, count
+
+
+def _corners(
+    face: np.ndarray, weld: np.ndarray, f: np.ndarray, k: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices of side k of faces f, in the order of their welded numbers, and the vertex opposite to it."""
+    i, j, opposite = face[f, k], face[f, (k + 1) % 3], face[f, (k + 2) % 3]
+    swap = weld[i] > weld[j]
+    return np.where(swap, j, i), np.where(swap, i, j), opposite

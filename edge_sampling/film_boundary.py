@@ -1,0 +1,212 @@
+"""The film boundary: what edges that move over the film add to the derivative of an image.
+
+For a pixel with filter k, I = ∫ k(u) L(u) du. Where an edge moves with the velocity du/dθ, its derivative gains
+
+    ∮ k(u) · (L⁻ − L⁺) · (n · du/dθ) dl,        n: unit normal of the edge on the film, from the − side to the + side
+
+(Li et al. 2018, Eq. 7, with the edge function's gradient written as a velocity). With the edge as a curve u(t), the length element and the normal
+join to n dl = (−u'ᵧ, u'ₓ) dt, so that neither is ever normalised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .device_edges import DeviceEdges
+from .edges import Edges
+from .meshes import Geometry
+from .projection import FilmPoint, Projection
+
+#: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so an edge that cannot be
+#: seen changes nothing, not even the last bit.
+LENGTH_UNIT = 2.0**-16
+
+
+@dataclass(frozen=True)
+class BoundarySamples:
+    """Samples of the film boundary.
+
+    position : mi.Point2f, (N,), pixels, detached; where to splat.
+    value    : mi.Spectrum, (N,), zero, with the gradient of (L⁻ − L⁺) · (n · du/dθ) dl in pixels².
+    alpha    : mi.Float, (N,), the same for the alpha channel.
+    wavelengths : mi.Spectrum or empty.
+    """
+
+    position: mi.Point2f
+    value: mi.Spectrum
+    alpha: mi.Float
+    wavelengths: mi.Wavelength
+
+
+class FilmBoundary:
+    """Samples the edges of a scene on the film of a sensor.
+
+    Parameters
+    ----------
+    geometry : the meshes.
+    edges : the edges that can move, on the host.
+    """
+
+    def __init__(self, geometry: Geometry, edges: Edges):
+        self.geometry = geometry
+        self.edges = DeviceEdges(edges)
+
+    def sample(
+        self,
+        sensor: mi.Sensor,
+        sampler: mi.Sampler,
+        count: int,
+        radiance: Callable[[mi.RayDifferential3f, mi.Sampler], tuple[mi.Spectrum, mi.Float]],
+    ) -> BoundarySamples:
+        """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
+
+        Edges are chosen in proportion to their length on the film, and points uniformly along them, both by one stratified number.
+
+        sampler : seeded for `count` lanes.
+        radiance : maps rays to (L, alpha), detached. Called for both sides of the edge with equal random numbers, so that an edge that is hidden,
+            or across which nothing jumps, contributes next to nothing rather than noise.
+
+        Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by it.
+        """
+        with dr.resume_grad():
+            projection = Projection(sensor)
+            positions = self.geometry.positions()
+        with dr.suspend_grad():
+            aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
+            edge, along, density = self._choose(projection, positions, sensor.film(), sampler, count)
+            a, b = self.edges.end_points(positions, edge)
+            segment = _clip(projection, projection.film(a), projection.film(b), sensor.film())
+            t, dt = segment.parameter(along)
+            tangent = _tangent(projection, a, b, t, aperture_sample)
+
+        # Only here does the gradient enter: the velocity of a point that is fixed on the edge.
+        with dr.resume_grad():
+            a, b = self.edges.end_points(positions, edge)
+            u = projection.film(dr.lerp(a, b, t), aperture_sample).position()
+            velocity = u - dr.detach(u)
+
+        with dr.suspend_grad():
+            n_dl = mi.Vector2f(-tangent.y, tangent.x) * (dt / density)
+            n = dr.normalize(n_dl)
+            u = dr.detach(u)
+            offset = self._offset(projection, dr.lerp(a, b, t)) * n
+            active = (density > 0) & (segment.length > 0) & dr.isfinite(dr.squared_norm(n_dl)) & _inside(u, sensor.film())
+            time = sensor.shutter_open()
+            if sensor.shutter_open_time() > 0:
+                time += sampler.next_1d() * sensor.shutter_open_time()
+            wavelength_sample = sampler.next_1d() if mi.is_spectral else 0.0
+            jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
+            for sign in (-1, 1):
+                ray, weight = sensor.sample_ray_differential(
+                    time,
+                    wavelength_sample,
+                    (u + sign * offset - projection.crop_offset) / projection.crop_size,
+                    mi.Point2f(0.5) if aperture_sample is None else aperture_sample,
+                    active,
+                )
+                L, alpha = radiance(ray, sampler.clone(), active)
+                jump -= sign * L * weight
+                alpha_jump -= sign * alpha
+            n_dl = dr.select(active, n_dl, 0)
+        with dr.resume_grad():
+            normal_velocity = dr.dot(n_dl, velocity)
+            return BoundarySamples(u, jump * normal_velocity, alpha_jump * normal_velocity, ray.wavelengths)
+
+    def _choose(
+        self, projection: Projection, positions: mi.Float, film: mi.Film, sampler: mi.Sampler, count: int
+    ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        """Choose edges in proportion to their length on the film: edge, position along its visible part in [0, 1), samples per unit of it."""
+        length = self._visible_length(projection, positions, film)
+        quantised = mi.UInt64(dr.ceil(mi.Float64(length) / LENGTH_UNIT))
+        cumulative = dr.cumsum(quantised)
+        total = mi.Float64(dr.gather(mi.UInt64, cumulative, self.edges.count - 1))
+        x = (mi.Float64(dr.arange(mi.UInt32, count)) + mi.Float64(sampler.next_1d())) * (total / count)
+        whole = mi.UInt64(x)
+        edge = dr.binary_search(0, self.edges.count - 1, lambda i: dr.gather(mi.UInt64, cumulative, i) <= whole)
+        size = mi.Float64(dr.gather(mi.UInt64, quantised, edge))
+        start = mi.Float64(dr.gather(mi.UInt64, cumulative, edge)) - size
+        along = dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float))
+        return edge, along, dr.select(total > 0, mi.Float(count * size / total), 0)
+
+    def _visible_length(self, projection: Projection, positions: mi.Float, film: mi.Film) -> mi.Float:
+        """Length on the film, in pixels, of the part of each edge inside the frame; 0 where nothing can jump across the edge: (E,)."""
+        everything = dr.arange(mi.UInt32, self.edges.count)
+        a, b = self.edges.end_points(positions, everything)
+        length = _clip(projection, projection.film(a), projection.film(b), film).length
+        jumps = self.edges.is_boundary(
+            positions,
+            everything,
+            projection.eye(),
+            view=projection.view() if projection.orthographic else None,
+            radius=projection.lens_radius(),
+            geometry=self.geometry,
+        )
+        return dr.select(jumps, length, 0)
+
+    def _offset(self, projection: Projection, p: mi.Point3f) -> mi.Float:
+        """How far from the edge its two sides are looked at, in pixels: just beyond what single precision can tell apart."""
+        ulp = dr.epsilon(mi.Float) * 2
+        in_world = 8 * ulp * dr.max(dr.abs(mi.Vector3f(p))) * projection.pixels_per_unit(projection.film(p))
+        on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
+        return in_world + on_film + 1e-4
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """The visible part of an edge: the interval of its parameter, the depths at its ends, and its length on the film in pixels."""
+
+    start: mi.Float
+    end: mi.Float
+    w_start: mi.Float
+    w_end: mi.Float
+    length: mi.Float
+
+    def parameter(self, s: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Edge parameter t that lies a fraction s along the segment *as seen on the film*, and dt/ds."""
+        d = dr.lerp(self.w_end, self.w_start, s)
+        extent = self.end - self.start
+        return self.start + extent * s * self.w_start / d, extent * self.w_start * self.w_end / dr.square(d)
+
+
+def _clip(projection: Projection, a: FilmPoint, b: FilmPoint, film: mi.Film) -> _Segment:
+    """Clip edges to the near and far planes and to the frame, widened by the blur of the lens (Liang and Barsky 1984)."""
+    lower, upper = _frame(film)
+    blur_a, blur_b = projection.blur(a), projection.blur(b)
+    start, end = mi.Float(0), mi.Float(1)
+    planes = [(a.z - projection.near, b.z - projection.near), (projection.far - a.z, projection.far - b.z)]
+    for i in (0, 1):
+        planes.append((a.xy[i] - lower[i] * a.w + blur_a, b.xy[i] - lower[i] * b.w + blur_b))
+        planes.append((upper[i] * a.w - a.xy[i] + blur_a, upper[i] * b.w - b.xy[i] + blur_b))
+    for at_a, at_b in planes:
+        crossing = at_a / (at_a - at_b)
+        start = dr.select(at_a < 0, dr.select(at_b < 0, 1, dr.maximum(start, crossing)), start)
+        end = dr.select(at_b < 0, dr.select(at_a < 0, 0, dr.minimum(end, crossing)), end)
+    at = lambda t: FilmPoint(dr.lerp(a.xy, b.xy, t), dr.lerp(a.w, b.w, t), dr.lerp(a.z, b.z, t))
+    p, q = at(start), at(end)
+    length = dr.select(start < end, dr.norm(q.position() - p.position()), 0)
+    # Written so that NaN, as from vertices that are not finite, counts as invisible.
+    return _Segment(start, end, p.w, q.w, dr.select((length > 0) & dr.isfinite(length), length, 0))
+
+
+def _frame(film: mi.Film) -> tuple[mi.ScalarPoint2f, mi.ScalarPoint2f]:
+    """The part of the film on which samples are taken, in pixels: the crop window, and the border if the film samples it."""
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    lower = mi.ScalarPoint2f(film.crop_offset()) - border
+    return lower, lower + mi.ScalarVector2f(film.crop_size()) + 2 * border
+
+
+def _inside(u: mi.Point2f, film: mi.Film) -> mi.Bool:
+    lower, upper = _frame(film)
+    return dr.all((u >= lower) & (u < upper))
+
+
+def _tangent(projection: Projection, a: mi.Point3f, b: mi.Point3f, t: mi.Float, aperture_sample: mi.Point2f | None) -> mi.Vector2f:
+    """du/dt along the edges, in pixels: derivative of a quotient of two linear functions."""
+    p, q = projection.film(a, aperture_sample), projection.film(b, aperture_sample)
+    w = dr.lerp(p.w, q.w, t)
+    u = dr.lerp(p.xy, q.xy, t) / w
+    return mi.Vector2f((q.xy - p.xy) - u * (q.w - p.w)) / w

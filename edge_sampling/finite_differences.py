@@ -1,0 +1,126 @@
+"""Reference derivatives: central differences of Mitsuba's `path`, with what they are uncertain about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from .motion import Motion
+
+
+@dataclass(frozen=True)
+class FiniteDifferences:
+    """A derivative image and its standard error.
+
+    mean : (H, W, C), float32, linear radiance per unit of θ.
+    standard_error : (H, W, C), float32; of the mean over the runs. It knows nothing of the bias of a step that is too long.
+    settings : how it was made.
+    """
+
+    mean: np.ndarray
+    standard_error: np.ndarray
+    settings: dict[str, Any]
+
+    def write(self, path: str | Path, metadata: dict[str, Any] | None = None) -> None:
+        """Write an EXR file: mean in R, G, B, standard error in the layer `standard_error`, settings in the header."""
+        from .exr import write_exr
+
+        write_exr(path, {"": self.mean, "standard_error": self.standard_error}, {**self.settings, **(metadata or {})})
+
+    @staticmethod
+    def read(path: str | Path) -> FiniteDifferences:
+        from .exr import read_exr
+
+        layers, metadata = read_exr(path)
+        return FiniteDifferences(layers[""], layers["standard_error"], metadata)
+
+
+def finite_differences(
+    scene: mi.Scene,
+    motion: Motion,
+    *,
+    step: float,
+    runs: int = 32,
+    spp: int = 4096,
+    max_depth: int = 2,
+    integrator: mi.Integrator | None = None,
+    sensor: int = 0,
+    seed: int = 0,
+    progress: bool = False,
+) -> FiniteDifferences:
+    """Central differences (I(+h) − I(−h)) / 2h over independent runs.
+
+    Both images of a run share their random numbers, drawn from a stratified sampler (`multijitter`): at hard edges this is 3 to 7 times less
+    noise than independent samples. Choose h so that the image moves by a few hundredths of a pixel: a tenth already smears hard edges visibly.
+
+    Parameters
+    ----------
+    step : h, in units of θ.
+    runs : number of independent runs, at least 2; their spread gives the standard error.
+    spp : samples per pixel of each image, a square number is best.
+    max_depth : of `path`, unless another `integrator` is given.
+
+    Raises
+    ------
+    ValueError : `step`, `runs` or `spp` out of range.
+    """
+    if not (np.isfinite(step) and step > 0):
+        raise ValueError(f"finite differences: the step must be > 0, got {step}")
+    if runs < 2 or spp < 1:
+        raise ValueError(f"finite differences: need at least 2 runs and 1 sample per pixel, got {runs} and {spp}")
+    integrator = integrator or mi.load_dict({"type": "path", "max_depth": max_depth})
+    camera = scene.sensors()[sensor]
+    total = square = 0.0
+    try:
+        for i in tqdm(range(runs), desc="finite differences", disable=not progress):
+            images = []
+            for theta in (step, -step):
+                motion.apply(theta)
+                images.append(np.array(render_stratified(scene, integrator, camera, seed + i, spp), np.float64))
+            difference = (images[0] - images[1]) / (2 * step)
+            total, square = total + difference, square + difference**2
+    finally:
+        motion.apply(0.0)
+    mean = total / runs
+    variance = np.maximum(square / runs - mean**2, 0) * runs / (runs - 1)
+    settings = {
+        "motion": str(motion),
+        "unit": motion.unit,
+        "step": step,
+        "runs": runs,
+        "spp": spp,
+        "seed": seed,
+        "integrator": " ".join(str(integrator).split()),
+        "mitsuba": mi.__version__,
+        "variant": mi.variant(),
+    }
+    return FiniteDifferences(mean.astype(np.float32), np.sqrt(variance / runs).astype(np.float32), settings)
+
+
+def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
+    """Render with the `multijitter` sampler, whichever the sensor has: (H, W, C), linear radiance.
+
+    integrator : a sampling integrator of Mitsuba (`path`, `direct`, ...).
+    """
+    from mitsuba.ad.integrators.common import ADIntegrator
+
+    film = sensor.film()
+    film.prepare([])
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    sampler.set_samples_per_wavefront(sampler.sample_count())
+    sampler.seed(seed, int(np.prod(np.array(film.crop_size()) + border)) * sampler.sample_count())
+    with dr.suspend_grad():
+        ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, sampler)
+        L, valid, _ = integrator.sample(scene, sampler, ray)
+        block = film.create_block()
+        alpha = dr.select(valid, mi.Float(1), 0)
+        ADIntegrator._splat_to_block(block, film, position, L * weight, 1.0, alpha, [], ray.wavelengths)
+        film.put_block(block)
+        return film.develop()

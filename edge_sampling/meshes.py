@@ -1,0 +1,153 @@
+"""Access to the geometry of a scene. The only module that knows how Mitsuba stores a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The shapes of a scene, sorted by what can be done with them.
+
+    meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known.
+    others : shapes without edges here (spheres, curves, instances, ...). They occlude and receive light, but must not move.
+    """
+
+    meshes: tuple[Any, ...]
+    others: tuple[Any, ...]
+
+    @staticmethod
+    def of(scene: mi.Scene) -> Geometry:
+        shapes = scene.shapes()
+        meshes = tuple(s for s in shapes if s.is_mesh() and s.class_name() != "EllipsoidsMesh")
+        others = tuple(s for s in shapes if s not in meshes)
+        return Geometry(meshes, others)
+
+    def key(self) -> tuple[tuple[int, int, int], ...]:
+        """What must stay the same for the edges found earlier to be valid: which meshes there are, and their sizes."""
+        return tuple((int(m.ptr), m.vertex_count(), m.face_count()) for m in self.meshes)
+
+    def moving(self) -> tuple[bool, ...]:
+        """For every mesh: do its vertices carry a gradient?"""
+        return tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
+
+    def refuse_moving_others(self, who: str) -> None:
+        """Refuse derivatives with respect to shapes whose silhouettes are not known.
+
+        Raises
+        ------
+        RuntimeError : a shape that is not a triangle mesh carries a gradient in one of its own parameters.
+        """
+        for shape in self.others:
+            params = mi.traverse(shape)
+            # Keys with a dot belong to the BSDF, the emitter or a texture of the shape.
+            own = [k for k in params.keys() if "." not in k]
+            moved = [k for k in own if _is_attached(params[k])]
+            if moved:
+                raise RuntimeError(
+                    f'{who}: shape "{shape.id()}" ({shape.class_name()}) moves ("{moved[0]}" carries a gradient), but its '
+                    "silhouettes cannot be sampled yet: only triangle meshes can move. Replace it by a mesh, or detach it."
+                )
+
+    def positions(self) -> mi.Float:
+        """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units, with their gradients."""
+        return _concat([m.vertex_positions_buffer() for m in self.meshes])
+
+    def normals(self) -> mi.Float:
+        """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Detached."""
+        return _concat(
+            [
+                dr.detach(m.vertex_normals_buffer())
+                if has_interpolated_normals(m)
+                else dr.zeros(mi.Float, 3 * m.vertex_count())
+                for m in self.meshes
+            ]
+        )
+
+
+def faces(mesh: Any) -> np.ndarray:
+    """Vertex indices of the triangles of a mesh: (F, 3), uint32, on the host."""
+    return np.array(mesh.faces_buffer()).reshape(-1, 3)
+
+
+def vertices(mesh: Any) -> np.ndarray:
+    """Vertex positions of a mesh: (V, 3), world space, on the host, detached."""
+    return np.array(dr.detach(mesh.vertex_positions_buffer())).reshape(-1, 3)
+
+
+def texture_coordinates(mesh: Any) -> np.ndarray | None:
+    """Texture coordinates of a mesh: (V, 2) on the host, or None."""
+    return np.array(dr.detach(mesh.vertex_texcoords_buffer())).reshape(-1, 2) if mesh.has_vertex_texcoords() else None
+
+
+def has_interpolated_normals(mesh: Any) -> bool:
+    return mesh.has_vertex_normals() and not mesh.has_face_normals()
+
+
+def has_face_attributes(mesh: Any) -> bool:
+    """Does the mesh carry attributes that are constant on a face, and so jump at each of its edges?"""
+    return any(k.startswith("face_") for k in mi.traverse(mesh).keys())
+
+
+def _concat(buffers: list[mi.Float]) -> mi.Float:
+    if not buffers:
+        return dr.zeros(mi.Float, 3)
+    return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
+
+
+def _is_attached(value: Any) -> bool:
+    return dr.is_diff_v(value) and dr.grad_enabled(value)
+
+
+def jumping_textures(scene: mi.Scene) -> list[str]:
+    """Names of the textures in the scene whose value jumps inside of a face, such as checkerboards and bitmaps with the `nearest` filter."""
+    return [f'"{t.id()}" ({t.class_name()})' for t in _objects(scene) if isinstance(t, mi.Texture) and _jumps(t)]
+
+
+def _objects(root: mi.Object) -> list[Any]:
+    """All objects below `root`, each once."""
+    found: list[Any] = []
+
+    class Children(mi.TraversalCallback):
+        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+            if isinstance(value, mi.Object) and value not in found:
+                found.append(value)
+
+        put_value = put_object = put
+
+    found.append(root)
+    for obj in found:  # grows as it goes
+        obj.traverse(Children())
+    return found
+
+
+def _jumps(texture: Any, pairs: int = 256, steps: int = 18) -> bool:
+    """Bisect random segments towards their steepest half: where the texture is continuous, the difference of the end points dies out."""
+    if not texture.is_spatially_varying() or not texture.class_name().startswith(("Bitmap", "Checkerboard")):
+        return False
+    with dr.suspend_grad():
+        rng = mi.PCG32(size=pairs)
+        si = dr.zeros(mi.SurfaceInteraction3f, pairs)
+        if mi.is_spectral:
+            si.wavelengths = mi.Wavelength(550)
+
+        def value(uv: mi.Point2f) -> mi.Spectrum:
+            si.uv = uv
+            return texture.eval(si)
+
+        difference = lambda f, g: dr.max(dr.abs(f - g))
+        p, q = mi.Point2f(rng.next_float32(), rng.next_float32()), mi.Point2f(rng.next_float32(), rng.next_float32())
+        at_p, at_q = value(p), value(q)
+        before = difference(at_p, at_q)
+        for _ in range(steps):
+            middle = 0.5 * (p + q)
+            at_middle = value(middle)
+            left = difference(at_p, at_middle) > difference(at_middle, at_q)
+            p, at_p = dr.select(left, p, middle), dr.select(left, at_p, at_middle)
+            q, at_q = dr.select(left, middle, q), dr.select(left, at_middle, at_q)
+        return bool(dr.any((before > 0) & (difference(at_p, at_q) > 0.3 * before)))

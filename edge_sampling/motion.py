@@ -1,0 +1,144 @@
+"""One-parameter motions of a scene: what is differentiated, by the integrators and by finite differences alike."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+class Motion:
+    """Moves one parameter of a scene along a line, or turns it about an axis: p(θ), with p(0) its value at construction.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    key : name of the parameter, as `mi.traverse(scene)` has it.
+    direction : displacement per unit of θ. For vertex positions and `to_world`, 3 numbers, world space; for any other parameter as many
+        numbers as it has, or 1 for all.
+    rotate : axis, 3 numbers, world space (need not be normalised); θ in radians. Only for vertex positions and `to_world`.
+    pivot : 3 numbers, world space, a point on the axis. Default: the mean of the vertices, or the origin of the `to_world` frame.
+    vertices : indices of the vertices that move. Default: all.
+
+    Raises
+    ------
+    ValueError : the key is unknown, or numbers are missing, too many, or not finite.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        key: str,
+        *,
+        direction: Sequence[float] | None = None,
+        rotate: Sequence[float] | None = None,
+        pivot: Sequence[float] | None = None,
+        vertices: Sequence[int] | None = None,
+    ):
+        self.params = mi.traverse(scene)
+        if key not in self.params:
+            close = difflib.get_close_matches(key, list(self.params.keys()), n=3, cutoff=0.4)
+            raise ValueError(f'unknown parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else ""))
+        if (direction is None) == (rotate is None):
+            raise ValueError(f'"{key}": give either a direction or an axis to rotate about')
+        value = self.params[key]
+        self.key = key
+        self.is_positions = key.endswith("vertex_positions")
+        self.is_transform = key.endswith("to_world")
+        if not (self.is_positions or self.is_transform or dr.is_float_v(value)):
+            raise ValueError(f'"{key}" is of type {type(value).__name__}, it cannot be varied continuously')
+        if rotate is not None and not (self.is_positions or self.is_transform):
+            raise ValueError(f'"{key}" cannot rotate: it is neither vertex positions nor a transformation')
+        if vertices is not None and not self.is_positions:
+            raise ValueError(f'"{key}" has no vertices to choose from')
+
+        self.initial = type(value)(dr.detach(value))
+        geometric = self.is_positions or self.is_transform
+        size = 3 if geometric else dr.size_v(value) * dr.width(value)
+        self.direction = None if direction is None else _numbers(key, "direction", direction, {size} if geometric else {1, size})
+        self.rotate = None if rotate is None else _numbers(key, "axis", rotate, {3})
+        if self.rotate is not None and not np.any(self.rotate):
+            raise ValueError(f'"{key}": the axis of rotation is zero')
+        self.pivot = None if pivot is None else _numbers(key, "pivot", pivot, {3})
+        self.moves = None
+        if self.is_positions:
+            p = np.array(self.initial).reshape(-1, 3)
+            chosen = np.arange(len(p)) if vertices is None else np.asarray(vertices, dtype=np.int64)
+            if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= len(p):
+                raise ValueError(f'"{key}": vertices must be in 0 … {len(p) - 1}, got {list(chosen)}')
+            self.moves = np.zeros(len(p), np.float32)
+            self.moves[chosen] = 1
+            if self.pivot is None:
+                self.pivot = p[chosen].mean(0)
+        elif self.is_transform and self.pivot is None:
+            self.pivot = np.array(mi.ScalarTransform4f(self.initial.matrix.numpy().reshape(4, 4)) @ mi.ScalarPoint3f(0))
+
+    @property
+    def unit(self) -> str:
+        """Unit of θ."""
+        if self.rotate is not None:
+            return "radian"
+        return "scene unit" if self.is_positions or self.is_transform else "unit"
+
+    def __str__(self) -> str:
+        numbers = lambda a: "(" + ", ".join(f"{x:g}" for x in a) + ")"
+        return f"{self.key} along {numbers(self.direction)}" if self.rotate is None else f"{self.key} about {numbers(self.rotate)}"
+
+    def apply(self, theta: mi.Float | float) -> None:
+        """Set the parameter to p(θ) and update the scene; attached if `theta` is."""
+        theta = mi.Float(theta)
+        if self.is_positions:
+            p = dr.unravel(mi.Point3f, self.initial)
+            moved = self._transform(theta) @ p
+            moved = dr.select(mi.Float(self.moves) > 0, moved, p)
+            value = dr.ravel(moved)
+        elif self.is_transform:
+            value = self._transform(theta) @ self.initial
+        else:
+            direction = mi.Float(self.direction)
+            value = dr.ravel(self.initial) + theta * direction if dr.size_v(self.initial) > 1 else self.initial + theta * direction
+            value = dr.unravel(type(self.initial), value) if dr.size_v(self.initial) > 1 else type(self.initial)(value)
+        self.params[self.key] = value
+        self.params.update()
+
+    def _transform(self, theta: mi.Float) -> mi.AffineTransform4f:
+        T = mi.Transform4f
+        if self.rotate is None:
+            return T().translate(theta * _vector(self.direction))
+        axis, pivot = _vector(self.rotate / np.linalg.norm(self.rotate)), _vector(self.pivot)
+        return T().translate(pivot) @ T().rotate(axis, dr.rad2deg(theta)) @ T().translate(-pivot)
+
+
+def derivative_image(
+    scene: mi.Scene, integrator: mi.Integrator, motion: Motion, *, sensor: int | mi.Sensor = 0, spp: int, seed: int = 0
+) -> mi.TensorXf:
+    """Derivative of the rendered image with respect to θ at θ = 0, in forward mode: (H, W, C), linear, per `motion.unit`.
+
+    The scene is left as it was at the construction of `motion`. Works with every differentiable integrator of Mitsuba.
+    """
+    theta = mi.Float(0)
+    dr.enable_grad(theta)
+    try:
+        motion.apply(theta)
+        dr.forward(theta, dr.ADFlag.ClearEdges)
+        image = integrator.render_forward(scene, motion.params, sensor=sensor, seed=seed, spp=spp)
+        dr.eval(image)
+    finally:
+        motion.apply(0.0)
+    return image
+
+
+def _vector(a: np.ndarray) -> mi.Vector3f:
+    return mi.Vector3f(*map(float, a))
+
+
+def _numbers(key: str, what: str, values: Sequence[float], sizes: set[int]) -> np.ndarray:
+    a = np.asarray(values, dtype=np.float32).reshape(-1)
+    if a.size not in sizes:
+        raise ValueError(f'"{key}": the {what} needs {" or ".join(map(str, sorted(sizes)))} numbers, got {a.size}')
+    if not np.isfinite(a).all():
+        raise ValueError(f'"{key}": the {what} must be finite, got {list(map(float, a))}')
+    return a

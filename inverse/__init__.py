@@ -1,0 +1,1 @@
+"""Inverse rendering: fits of pose, material, light and shape, through the public interface of Mitsuba."""

@@ -1,0 +1,5 @@
+import sys
+
+from rimlight.cli import main
+
+sys.exit(main())

@@ -1,0 +1,416 @@
+"""The commands: one frozen dataclass each, whose fields are its options."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import Positional, UseAppendAction, arg
+
+import rimlight
+from rimlight import pictures
+from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image, finite_differences
+from rimlight.edge_sampling.exr import write_exr
+
+from . import _loading
+from ._comparison import Comparison, compare
+from ._loading import InputError, at_least, expected
+
+#: Samples of one launch. More are split, so that a progress bar can move and an interruption is heard.
+MAX_SAMPLES = 2**20
+
+#: Samples of one launch that finite differences may ask for: memory for the state of their sampler is needed at once.
+MAX_REFERENCE_SAMPLES = 2**28
+
+#: Texts of refusals by our own integrators ("who: what"); other RuntimeErrors are bugs.
+REFUSAL = r"^[\w ]+: "
+
+Numbers = Annotated[str | None, arg(metavar="X,Y,Z")]
+
+
+# ------------------------------------------------------------------ shared options
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OnScene:
+    scene: Annotated[Positional[Path], arg(metavar="SCENE.XML")]
+    """Scene file of Mitsuba 3."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=["-D"], metavar="KEY=VALUE")] = ()
+    """Parameter of the scene file, such as res=128."""
+    variant: str = "llvm_ad_rgb"
+    """Variant of Mitsuba."""
+
+    def load(self) -> Any:
+        _loading.use_variant(self.variant)
+        return _loading.load_scene(self.scene, self.define)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OnSensor(_OnScene):
+    sensor: int = 0
+    """Number of the sensor."""
+    seed: int = 0
+    """Seed of the random numbers."""
+
+    def load(self) -> Any:
+        at_least(0, sensor=self.sensor, seed=self.seed)
+        scene = super().load()
+        if self.sensor >= len(scene.sensors()):
+            raise InputError(
+                f"--sensor: the scene has {len(scene.sensors())} sensors, there is no number {self.sensor}"
+            )
+        return scene
+
+    def pixels(self, scene: Any) -> int:
+        return int(np.prod(scene.sensors()[self.sensor].film().crop_size()))
+
+    def metadata(self, **more: Any) -> dict[str, Any]:
+        versions = {"rimlight": rimlight.__version__, "mitsuba": mi.__version__, "drjit": dr.__version__}
+        return {"scene": self.scene, "define": " ".join(self.define), "variant": self.variant, **versions, **more}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OnMotion(_OnSensor):
+    param: Annotated[str | None, arg(metavar="KEY")] = None
+    """Parameter that moves; `rimlight params` lists them."""
+    camera: Literal["translate", "rotate"] | None = None
+    """Move the camera instead."""
+    direction: Numbers = None
+    """Displacement per unit of θ, world space. For colours etc.: as many numbers as the parameter has, or one."""
+    rotate: Numbers = None
+    """Axis of a rotation, world space; θ in radians."""
+    pivot: Numbers = None
+    """Point on that axis (default: the mean of the vertices, or the origin of what moves)."""
+    vertices: Annotated[str | None, arg(metavar="I,J,...")] = None
+    """Only these vertices move."""
+
+    def load_motion(self, scene: Any) -> Motion:
+        return _loading.load_motion(
+            scene,
+            param=self.param,
+            camera=self.camera,
+            direction=self.direction,
+            rotate=self.rotate,
+            pivot=self.pivot,
+            vertices=self.vertices,
+            sensor=self.sensor,
+        )
+
+    def describe(self, motion: Motion) -> str:
+        return f"{motion}, vertices {self.vertices}" if self.vertices else str(motion)
+
+    def reference(
+        self, scene: Any, motion: Motion, *, step: float, runs: int, spp: int, max_depth: int
+    ) -> FiniteDifferences:
+        most = MAX_REFERENCE_SAMPLES // self.pixels(scene)
+        if spp > most:
+            raise InputError(
+                f"finite differences: {spp} spp of this film exceed the limit of {most}; use more --runs instead"
+            )
+        with expected(ValueError, pattern=REFUSAL):
+            return finite_differences(
+                scene,
+                motion,
+                step=step,
+                runs=runs,
+                spp=spp,
+                max_depth=max_depth,
+                sensor=self.sensor,
+                seed=self.seed,
+                progress=sys.stderr.isatty(),
+            )
+
+
+# ------------------------------------------------------------------ work
+
+
+def _seeds(spp: int, pixels: int, first: int) -> list[tuple[int, int]]:
+    """(seed, spp) of the launches that make up `spp`."""
+    count = -(-spp * pixels // MAX_SAMPLES)
+    count = min(count, spp)
+    return [(first + i, spp // count + (i < spp % count)) for i in range(count)]
+
+
+def _accumulate(render: Callable[[int, int], Any], launches: list[tuple[int, int]], label: str) -> np.ndarray:
+    """Mean of `render(seed, spp)` over the launches, weighted by spp: (H, W, C), float32."""
+    total = np.float64(0)
+    with _progress(launches, label) as bar:
+        for seed, spp in bar:
+            with expected(RuntimeError, pattern=REFUSAL):
+                total = total + spp * np.array(render(seed, spp), np.float64)
+    image = (total / sum(spp for _, spp in launches)).astype(np.float32)
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+        raise InputError(
+            f"the film or integrator makes images of shape {image.shape}; 1, 3 or 4 channels are supported"
+        )
+    return image
+
+
+def _progress(items: list[Any], label: str) -> Any:
+    """A bar on a terminal, after half a second; nothing elsewhere."""
+    return tqdm(items, desc=label, leave=False, delay=0.5, disable=None)
+
+
+@contextmanager
+def _writing() -> Iterator[None]:
+    with expected(OSError, who="--out"):
+        yield
+
+
+def _write_image(stem: Path, image: np.ndarray, metadata: dict[str, Any]) -> None:
+    write_exr(stem.with_suffix(".exr"), {"": image}, metadata)
+    pictures.write_image(stem.with_suffix(".png"), image)
+
+
+# ------------------------------------------------------------------ commands
+
+
+@dataclass(frozen=True)
+class SysInfo:
+    """Print versions, hardware, and what works here."""
+
+    def run(self) -> int:
+        from rimlight.sys_info import print_sys_info
+
+        print_sys_info()
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Params(_OnScene):
+    """List the parameters of a scene that can be differentiated: ∂, and D where they move edges."""
+
+    def run(self) -> int:
+        rows = [("parameter", "type", "size", "flags")]
+        for key, value, flags in _loading.differentiable(self.load()):
+            shape = np.shape(value) or (1,)
+            rows.append((key, type(value).__name__, " x ".join(map(str, shape)), flags))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        for row in rows:
+            print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(_OnSensor):
+    """Render a scene to an EXR and a PNG file."""
+
+    out: Path
+    """Folder for image.exr and image.png, or name of the EXR file."""
+    integrator: str = "direct_edge"
+    """Plugin that renders."""
+    spp: int = 64
+    """Samples per pixel."""
+
+    def run(self) -> int:
+        at_least(1, spp=self.spp)
+        to_file = self.out.suffix == ".exr"
+        _loading.check_output(self.out, folder=not to_file)
+        scene = self.load()
+        integrator = _loading.load_integrator(self.integrator)
+        start = time.perf_counter()
+        image = _accumulate(
+            lambda seed, spp: mi.render(scene, integrator=integrator, sensor=self.sensor, spp=spp, seed=seed),
+            _seeds(self.spp, self.pixels(scene), self.seed),
+            "render",
+        )
+        metadata = self.metadata(
+            integrator=self.integrator, spp=self.spp, seed=self.seed, seconds=f"{time.perf_counter() - start:.3f}"
+        )
+        folder = _loading.make_folder(self.out.parent if to_file else self.out)
+        with _writing():
+            _write_image(folder / (self.out.stem if to_file else "image"), image, metadata)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gradient(_OnMotion):
+    """Render the derivative of an image with respect to a motion, and the image."""
+
+    out: Path
+    """Folder for image.exr, image.png, derivative.exr and derivative.png."""
+    integrator: str = "direct_edge"
+    """Plugin that differentiates."""
+    spp: int = 256
+    """Samples per pixel."""
+
+    def run(self) -> int:
+        at_least(1, spp=self.spp)
+        _loading.check_output(self.out, folder=True)
+        scene = self.load()
+        integrator = _loading.load_integrator(self.integrator)
+        motion = self.load_motion(scene)
+        launches = _seeds(self.spp, self.pixels(scene), self.seed)
+
+        start = time.perf_counter()
+        derivative = _accumulate(
+            lambda seed, spp: derivative_image(scene, integrator, motion, sensor=self.sensor, spp=spp, seed=seed),
+            launches,
+            "derivative",
+        )
+        seconds = time.perf_counter() - start
+        image = _accumulate(
+            lambda seed, spp: mi.render(scene, integrator=integrator, sensor=self.sensor, spp=spp, seed=seed),
+            launches,
+            "image",
+        )
+
+        what = self.describe(motion)
+        metadata = self.metadata(integrator=self.integrator, spp=self.spp, seed=self.seed, seconds=f"{seconds:.3f}")
+        folder = _loading.make_folder(self.out)
+        with _writing():
+            _write_image(folder / "image", image, metadata)
+            moved = {"key": motion.key, "motion": what, "unit": motion.unit}
+            write_exr(folder / "derivative.exr", {"": derivative}, {**metadata, **moved})
+            pictures.write_derivative(folder / "derivative.png", derivative, title=what, unit=motion.unit)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FiniteDifferencesCommand(_OnMotion):
+    """Render a reference derivative by central differences of Mitsuba's `path`."""
+
+    out: Path
+    """EXR file to write; its layer `standard_error` says how far to trust it."""
+    step: float
+    """Step h of (I(+h) - I(-h)) / 2h. Choose it to move the image by a few hundredths of a pixel."""
+    runs: int = 32
+    """Independent runs, at least 2."""
+    spp: int = 4096
+    """Samples per pixel of each image."""
+    max_depth: int = 2
+    """`max_depth` of `path`."""
+
+    def run(self) -> int:
+        if self.out.suffix != ".exr":
+            raise InputError(f'--out: "{self.out}" must end in .exr')
+        at_least(1, spp=self.spp, max_depth=self.max_depth)
+        _loading.check_output(self.out, folder=False)
+        scene = self.load()
+        motion = self.load_motion(scene)
+        start = time.perf_counter()
+        reference = self.reference(
+            scene, motion, step=self.step, runs=self.runs, spp=self.spp, max_depth=self.max_depth
+        )
+        seconds = f"{time.perf_counter() - start:.3f}"
+        _loading.make_folder(self.out.parent)
+        with _writing():
+            reference.write(self.out, self.metadata(motion=self.describe(motion), key=motion.key, seconds=seconds))
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(_OnMotion):
+    """Compare a derivative with finite differences. Exit code 1 where they disagree by more than their noise."""
+
+    step: float
+    """Step h of the finite differences."""
+    integrator: str = "direct_edge"
+    """Plugin that differentiates."""
+    spp: int = 64
+    """Samples per pixel of one derivative."""
+    seeds: int = 16
+    """Derivatives to average, at least 2; their spread gives the standard error."""
+    runs: int = 16
+    """Independent runs of the finite differences, at least 2."""
+    fd_spp: int = 1024
+    """Samples per pixel of each image of the finite differences."""
+    max_depth: int = 2
+    """`max_depth` of the `path` integrator that the finite differences use."""
+    out: Annotated[Path | None, arg(metavar="FILE.png")] = None
+    """Picture of both and their difference."""
+
+    def run(self) -> int:
+        at_least(1, spp=self.spp, fd_spp=self.fd_spp, max_depth=self.max_depth)
+        at_least(2, seeds=self.seeds, runs=self.runs)
+        if self.out:
+            if self.out.suffix != ".png":
+                raise InputError(f'--out: "{self.out}" must end in .png')
+            _loading.check_output(self.out, folder=False)
+        scene = self.load()
+        integrator = _loading.load_integrator(self.integrator)
+        motion = self.load_motion(scene)
+        what = self.describe(motion)
+
+        start = time.perf_counter()
+        derivative, error = self._derivative(scene, integrator, motion)
+        seconds = [time.perf_counter() - start]
+        start = time.perf_counter()
+        reference = self.reference(
+            scene, motion, step=self.step, runs=self.runs, spp=self.fd_spp, max_depth=self.max_depth
+        )
+        seconds.append(time.perf_counter() - start)
+
+        comparison = compare(derivative, error, reference)
+        width, height = scene.sensors()[self.sensor].film().crop_size()
+        print(f"scene               {self.scene.name}, {width} x {height}")
+        print(f"motion              {what}, per {motion.unit}")
+        print(f"derivative          {self.integrator}, {self.seeds} x {self.spp} spp: {seconds[0]:.2f} s")
+        print(f"finite differences  step {self.step:g}, {self.runs} runs of {self.fd_spp} spp: {seconds[1]:.2f} s")
+        print(comparison)
+        if self.out:
+            _loading.make_folder(self.out.parent)
+            with _writing():
+                self._write_panels(what, motion.unit, derivative, reference, comparison)
+        return 0 if comparison.agrees else 1
+
+    def _derivative(self, scene: Any, integrator: Any, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+        """Mean over the seeds, and its standard error."""
+        renders = []
+        with _progress(list(range(self.seeds)), "derivative") as bar:
+            for k in bar:
+                launches = _seeds(self.spp, self.pixels(scene), self.seed)
+                launches = [(seed + k * len(launches), spp) for seed, spp in launches]
+                render = lambda seed, spp: derivative_image(  # noqa: E731
+                    scene, integrator, motion, sensor=self.sensor, spp=spp, seed=seed
+                )
+                renders.append(_accumulate(render, launches, "launch"))
+        return np.mean(renders, axis=0), np.std(renders, axis=0, ddof=1) / np.sqrt(self.seeds)
+
+    def _write_panels(
+        self, what: str, unit: str, derivative: np.ndarray, reference: FiniteDifferences, result: Comparison
+    ) -> None:
+        assert self.out is not None
+        panels = [
+            pictures.Panel(derivative, self.integrator, "derivative"),
+            pictures.Panel(reference.mean, "finite differences", "derivative"),
+            pictures.Panel(derivative - reference.mean, f"difference (rel. L1 {result.relative_l1:.1%})", "derivative"),
+        ]
+        pictures.write_panels(self.out, panels, title=what, unit=unit)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Make a page with derivative images and a fit, about a minute's work."""
+
+    out: Path = Path("demo")
+    """Folder for index.html and the pictures."""
+
+    def run(self) -> int:
+        from rimlight.inverse import demo
+
+        _loading.check_output(self.out, folder=True)
+        _loading.use_variant("llvm_ad_rgb")
+        with _writing():
+            demo.main(self.out)
+        return 0
+
+
+COMMANDS = {
+    "sys-info": SysInfo,
+    "params": Params,
+    "render": Render,
+    "gradient": Gradient,
+    "check": Check,
+    "finite-differences": FiniteDifferencesCommand,
+    "demo": Demo,
+}
