@@ -39,7 +39,7 @@ class BoundarySamples:
     position: mi.Point2f
     value: mi.Spectrum
     alpha: mi.Float
-    wavelengths: mi.Wavelength
+    wavelengths: mi.Spectrum
 
 
 class FilmBoundary:

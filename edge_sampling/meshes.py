@@ -47,7 +47,7 @@ class Geometry:
             params = mi.traverse(shape)
             # Keys with a dot belong to the BSDF, the emitter or a texture of the shape.
             own = [k for k in params.keys() if "." not in k]
-            moved = [k for k in own if _is_attached(params[k])]
+            moved = [k for k in own if dr.grad_enabled(params[k])]
             if moved:
                 raise RuntimeError(
                     f'{who}: shape "{shape.id()}" ({shape.class_name()}) moves ("{moved[0]}" carries a gradient), but its '
@@ -100,10 +100,6 @@ def _concat(buffers: list[mi.Float]) -> mi.Float:
     return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
 
 
-def _is_attached(value: Any) -> bool:
-    return dr.is_diff_v(value) and dr.grad_enabled(value)
-
-
 def jumping_textures(scene: mi.Scene) -> list[str]:
     """Names of the textures in the scene whose value jumps inside of a face, such as checkerboards and bitmaps with the `nearest` filter."""
     return [f'"{t.id()}" ({t.class_name()})' for t in _objects(scene) if isinstance(t, mi.Texture) and _jumps(t)]
@@ -134,7 +130,7 @@ def _jumps(texture: Any, pairs: int = 256, steps: int = 18) -> bool:
         rng = mi.PCG32(size=pairs)
         si = dr.zeros(mi.SurfaceInteraction3f, pairs)
         if mi.is_spectral:
-            si.wavelengths = mi.Wavelength(550)
+            si.wavelengths = type(si.wavelengths)(550)
 
         def value(uv: mi.Point2f) -> mi.Spectrum:
             si.uv = uv

@@ -34,10 +34,11 @@ class ShadingBoundary:
     def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...]):
         self.geometry = geometry
         self.moving_meshes = [m for m, moves in zip(geometry.meshes, moving, strict=True) if moves]
-        # Static points are concerned by moving edges only: put these first.
+        # Static points that see static lights are concerned by moving edges only: put these first.
         moves = np.array(moving)[edges.mesh].any(axis=1)
         self.edges = DeviceEdges(edges.take(np.argsort(~moves, kind="stable")))
         self.moving_count = int(moves.sum())
+        self.lights_move = any(m.is_emitter() for m in self.moving_meshes)
 
     def sample(self, scene: mi.Scene, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, camera_moves: bool) -> mi.Spectrum:
         """One sample of the boundary integral at each of `si`, for emitted light only.
@@ -53,10 +54,10 @@ class ShadingBoundary:
             positions = self.geometry.positions()
         with dr.suspend_grad():
             bsdf = si.bsdf()
-            x_moves = mi.Bool(camera_moves)
+            everything = mi.Bool(camera_moves or self.lights_move)
             for mesh in self.moving_meshes:
-                x_moves |= si.shape == mi.ShapePtr(mesh)
-            edge, density = self._choose(positions, sampler.next_1d(), x_moves)
+                everything |= si.shape == mi.ShapePtr(mesh)
+            edge, density = self._choose(positions, sampler.next_1d(), everything)
             t = sampler.next_1d()
             a, b = edges.end_points(positions, edge)
             x, p = si.p, dr.lerp(a, b, t)

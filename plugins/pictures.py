@@ -53,7 +53,7 @@ def signed(derivative: Any) -> np.ndarray:
 
 def symmetric_limit(derivatives: Sequence[Any], percentile: float = 99) -> float:
     """A scale ±limit that fits all derivatives: the percentile of their absolute values that are not 0. Never 0."""
-    values = np.concatenate([np.abs(signed(d)).ravel() for d in derivatives])
+    values = np.concatenate([np.zeros(0), *(np.abs(signed(d)).ravel() for d in derivatives)])
     values = values[np.isfinite(values) & (values > 0)]
     return float(np.percentile(values, percentile)) if values.size else 1.0
 
@@ -75,11 +75,17 @@ def write_derivative(path: str | Path, derivative: Any, *, title: str, unit: str
     _save(figure, path)
 
 
-def write_panels(path: str | Path, panels: Sequence[Panel], *, title: str = "", unit: str = "unit of θ") -> None:
-    """Write pictures in a row. All derivatives share one symmetric scale, and its colour bar."""
+def write_panels(
+    path: str | Path, panels: Sequence[Panel], *, title: str = "", unit: str = "", limit: float | None = None
+) -> None:
+    """Write pictures in a row. All derivatives share one symmetric scale, and its colour bar.
+
+    unit : as in `write_derivative`; none for a difference of images.
+    limit : end of the scale. Default: one that fits them all.
+    """
     figure, row = _row(len(panels))
     derivatives = [p.image for p in panels if p.kind == "derivative"]
-    limit = symmetric_limit(derivatives)
+    limit = limit or symmetric_limit(derivatives)
     mappable = None
     for axes, panel in zip(row, panels, strict=True):
         axes.set_title(panel.caption, fontsize=9)
@@ -126,7 +132,7 @@ def _bar(figure: Figure, axes: Any, mappable: Any, unit: str) -> None:
     bar = figure.colorbar(
         mappable, ax=axes, extend="both", fraction=0.046 if isinstance(axes, Axes) else 0.03, pad=0.02
     )
-    bar.set_label(f"radiance per {unit}", fontsize=8)
+    bar.set_label(f"radiance per {unit}" if unit else "radiance", fontsize=8)
     bar.ax.tick_params(labelsize=7)
 
 

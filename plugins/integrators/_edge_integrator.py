@@ -12,6 +12,30 @@ from mitsuba.ad.integrators.common import ADIntegrator
 from rimlight.edge_sampling import Edges, FilmBoundary, Geometry, Projection, ShadingBoundary, find_edges, jumping_textures
 
 
+@dataclass
+class Sample:
+    """Radiance and alpha of film samples, or their derivatives. (A Dr.Jit structure: not frozen.)"""
+
+    L: mi.Spectrum
+    alpha: mi.Float
+
+
+@dataclass(frozen=True)
+class Term:
+    """The film samples of one term of the derivative.
+
+    value : attached; only its gradient counts.
+    weight : of each sample in the film's weight channel.
+    per_pixel : how many neighbours in the wavefront belong to one pixel, 0 if they are in no order.
+    """
+
+    position: mi.Point2f
+    value: Sample
+    wavelengths: mi.Spectrum
+    weight: float
+    per_pixel: int
+
+
 @dataclass(frozen=True)
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera does."""
@@ -51,34 +75,42 @@ class EdgeIntegrator(ADIntegrator):
         -------
         mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
         """
+        # A parameter that carries a gradient may well not show in the image: then the derivative is zero. None at all is a mistake.
+        free = dr.ADFlag.AllowNoGrad if params is not None and dr.grad_enabled(dict(params)) else dr.ADFlag(0)
         with dr.suspend_grad():
-            image = self._attached_image(scene, sensor, seed, spp, dr.ADMode.Forward)
-            # A parameter that carries a gradient may well not show in the image: then the derivative is zero. None at all is a mistake.
-            free = dr.ADFlag.AllowNoGrad if params is not None and dr.grad_enabled(dict(params)) else dr.ADFlag(0)
+            film, terms = self._terms(scene, sensor, seed, spp, dr.ADMode.Forward)
             with dr.resume_grad():
-                dr.forward_to(image, flags=dr.ADFlag.Default | free)
-        return dr.grad(image)
+                values = dr.forward_to([t.value for t in terms], flags=dr.ADFlag.Default | free)
+            return self._develop(film, terms, values)
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the image, makes of them."""
         with dr.suspend_grad():
-            image = self._attached_image(scene, sensor, seed, spp, dr.ADMode.Backward)
+            film, terms = self._terms(scene, sensor, seed, spp, dr.ADMode.Backward)
             with dr.resume_grad():
+                # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray is traced for it.
+                values = [dr.zeros(type(t.value), dr.width(t.position)) for t in terms]
+                dr.enable_grad(values)
+                image = self._develop(film, terms, values)
                 dr.set_grad(image, grad_in)
                 dr.enqueue(dr.ADMode.Backward, image)
+                dr.traverse(dr.ADMode.Backward)
+                for term, value in zip(terms, values, strict=True):
+                    dr.set_grad(term.value, dr.grad(value))
+                    dr.enqueue(dr.ADMode.Backward, term.value)
                 dr.traverse(dr.ADMode.Backward)
             dr.eval()
 
     # ---------------------- Derivative image ----------------------
 
-    def _attached_image(self, scene, sensor, seed, spp, mode) -> mi.TensorXf:
-        """An image whose values mean nothing, and whose gradient is that of the rendered image."""
+    def _terms(self, scene, sensor, seed, spp, mode) -> tuple[mi.Film, list[Term]]:
+        """The samples of all terms of the derivative."""
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         film = sensor.film()
-        film.prepare([])
         sppc, sppp, sppi = (self._override(own, spp, sensor) for own in (self.sppc, self.sppp, self.sppi))
         boundaries = self._boundaries_of(scene, sensor, sppi)
+        terms = []
 
         # ---------------------- Interior ----------------------
 
@@ -89,11 +121,7 @@ class EdgeIntegrator(ADIntegrator):
         if sppc > 0:
             L, valid, _, _ = self.sample(mode, scene, sampler, ray)
         with dr.resume_grad():
-            block = film.create_block()
-            block.set_coalesce(block.coalesce() and weights >= 4)
-            alpha = dr.select(valid, mi.Float(1), 0)
-            ADIntegrator._splat_to_block(block, film, position, L * ray_weight, 1.0, alpha, [], ray.wavelengths)
-            film.put_block(block)
+            terms.append(Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights))
 
         # At a pixel, the weights of the interior samples add up to `weights` times the integral of the filter. The film divides by that sum: so
         # samples of boundaries, of weight zero, are normalised as the image is, for every filter.
@@ -102,14 +130,9 @@ class EdgeIntegrator(ADIntegrator):
 
         if boundaries is not None and sppp > 0:
             sampler, _ = self._sampler(sensor, 0xFFFFFFFF ^ seed, sppp)
-            radiance = lambda *args: self._primal(scene, *args)
-            s = boundaries.film.sample(sensor, sampler, sampler.wavefront_size(), radiance)
+            s = boundaries.film.sample(sensor, sampler, sampler.wavefront_size(), lambda *args: self._side(scene, *args))
             with dr.resume_grad():
-                block = film.create_block()
-                block.set_coalesce(False)
-                value, alpha = s.value * weights, s.alpha * weights
-                ADIntegrator._splat_to_block(block, film, s.position, value, 0.0, alpha, [], s.wavelengths)
-                film.put_block(block)
+                terms.append(Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0))
 
         # ---------------------- Boundaries at shading points ----------------------
 
@@ -118,17 +141,27 @@ class EdgeIntegrator(ADIntegrator):
             ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
             L = self.sample_shading_boundary(scene, sampler, ray, boundaries)
             with dr.resume_grad():
-                L *= ray_weight
-                block = film.create_block()
-                block.set_coalesce(block.coalesce() and sppi >= 4)
-                ADIntegrator._splat_to_block(block, film, position, L * (weights / sppi), 0.0, 0.0, [], ray.wavelengths)
-                film.put_block(block)
+                L *= ray_weight * (weights / sppi)
+                terms.append(Term(position, Sample(L, mi.Float(0)), ray.wavelengths, 0.0, sppi))
+        return film, terms
 
-        with dr.resume_grad():
-            return film.develop()
+    @staticmethod
+    def _develop(film: mi.Film, terms: list[Term], values: list[Sample]) -> mi.TensorXf:
+        """The image that the film makes of `values` at the positions of `terms`: (H, W, C)."""
+        film.prepare([])
+        for term, value in zip(terms, values, strict=True):
+            block = film.create_block()
+            # Mitsuba may add up neighbours in a wavefront first, if those belong to one pixel.
+            block.set_coalesce(block.coalesce() and term.per_pixel >= 4)
+            ADIntegrator._splat_to_block(
+                block, film, term.position, value.L, term.weight, value.alpha, [], term.wavelengths
+            )
+            film.put_block(block)
+        return film.develop()
 
-    def _primal(self, scene, ray, sampler, active) -> tuple[mi.Spectrum, mi.Float]:
-        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active)
+    def _side(self, scene, ray, sampler, active) -> tuple[mi.Spectrum, mi.Float]:
+        """Radiance and alpha beside an edge."""
+        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=True)
         return L, dr.select(valid, mi.Float(1), 0)
 
     # ---------------------- What moves ----------------------

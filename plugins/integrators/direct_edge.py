@@ -64,8 +64,10 @@ class DirectEdgeIntegrator(EdgeIntegrator):
         super().__init__(props)
         self.max_depth = 2
 
-    def sample(self, mode, scene, sampler, ray, active=True, **_):
+    def sample(self, mode, scene, sampler, ray, active=True, beyond_horizon=False, **_):
         """Estimate the radiance along camera rays. Call it with gradients suspended: it resumes them where they belong.
+
+        beyond_horizon : turn shading normals that face away from a visible face back to its horizon, see `_up_to_horizon`.
 
         Returns
         -------
@@ -85,6 +87,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
+        if beyond_horizon:
+            _up_to_horizon(si, ray)
         bsdf = si.bsdf(ray)
         valid = active & si.is_valid() & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
         if scene.environment() is not None and not self.hide_emitters:
@@ -114,6 +118,22 @@ class DirectEdgeIntegrator(EdgeIntegrator):
             onwards = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip).spawn_ray(ray.d)
             pi[skip] = self.skip_area_emitters(scene, onwards, True, skip)
         return pi
+
+
+def _up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
+    """Turn interpolated normals that face away from the viewer, on a face that does not, until they just face them.
+
+    Just inside of the silhouette of a smooth-shaded mesh such normals make a black fringe, whose inner border is a jump that lies on no edge.
+    The finer the mesh, the narrower the fringe: its two borders are taken together, as one jump from the background to the surface beside it.
+    """
+    to_viewer = -ray.d
+    side = dr.sign(dr.dot(si.n, to_viewer))
+    cos = side * dr.dot(si.sh_frame.n, to_viewer)
+    ε = 1e-4
+    away = si.is_valid() & (cos < ε)
+    si.sh_frame.n = dr.select(away, dr.normalize(si.sh_frame.n + side * (ε - cos) * to_viewer), si.sh_frame.n)
+    si.initialize_sh_frame()
+    si.wi = dr.select(away, si.to_local(to_viewer), si.wi)
 
 
 class _Lights:

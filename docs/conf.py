@@ -1,0 +1,43 @@
+"""Sphinx configuration. Warnings are errors: `make docs`."""
+
+import sys
+from pathlib import Path
+
+import rimlight
+import mitsuba
+
+# The API pages import modules whose annotations need a variant
+mitsuba.set_variant("llvm_ad_rgb")
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "Rimlight"
+author = "The Rimlight authors"
+release = version = rimlight.__version__
+html_title = f"Rimlight {version}"
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx_inline_tabs",
+    "sphinxcontrib.bibtex",
+    "house_docstrings",
+    "plugin_pages",
+]
+myst_enable_extensions = ["amsmath", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+bibtex_bibfiles = ["references.bib"]
+bibtex_default_style = "plain"
+bibtex_reference_style = "author_year"
+
+html_theme = "furo"
+html_theme_options = {"sidebar_hide_name": False}
+html_show_sphinx = False
+exclude_patterns = ["_build", "performance/*"]  # tables that index pages include
+math_eqref_format = "({number})"
+math_numfig = False
+
+default_role = "code"
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+autodoc_preserve_defaults = True

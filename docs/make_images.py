@@ -1,0 +1,67 @@
+"""Make the pictures of the README and the documentation:  python docs/make_images.py
+
+About three minutes on two cores. Writes docs/images/overview.png.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+import rimlight  # noqa: F401  (first: it chooses the LLVM library)
+
+IMAGES = Path(__file__).parent / "images"
+RES = 160
+
+#: Samples per pixel of a launch, and launches, of the derivative images.
+SPP, LAUNCHES = 64, 32
+
+#: Step (scene units), runs and samples per pixel of the finite differences.
+STEP, RUNS, REFERENCE_SPP = 1e-3, 8, 1024
+
+
+def overview(path: Path) -> None:
+    """The derivative with respect to a camera motion: Rimlight, Mitsuba, finite differences."""
+    from rimlight import pictures, scenes
+    from rimlight.edge_sampling import Motion, derivative_image, finite_differences
+
+    scene = mi.load_file(str(scenes.path("objects")), res=RES)
+    motion = Motion(scene, "camera.to_world", direction=[1, 0, 0])
+
+    def derivative(name: str) -> np.ndarray:
+        integrator = mi.load_dict({"type": name})
+        start = time.perf_counter()
+        launches = [derivative_image(scene, integrator, motion, spp=SPP, seed=i) for i in range(LAUNCHES)]
+        image = np.mean([np.array(launch) for launch in launches], axis=0)
+        print(f"{name}: {time.perf_counter() - start:.1f} s")
+        return image
+
+    image = np.array(mi.render(scene, spp=512))
+    edge, projective = derivative("direct_edge"), derivative("direct_projective")
+    reference = finite_differences(scene, motion, step=STEP, runs=RUNS, spp=REFERENCE_SPP, progress=True)
+    error = lambda d: np.abs(d - reference.mean).sum() / np.abs(reference.mean).sum()  # noqa: E731
+    noise = np.sqrt(2 / np.pi) * reference.standard_error.sum() / np.abs(reference.mean).sum()
+    pictures.write_panels(
+        path,
+        [
+            pictures.Panel(image, "image"),
+            pictures.Panel(edge, f"Rimlight: direct_edge\nrel. L1 error {error(edge):.0%}", "derivative"),
+            pictures.Panel(
+                projective, f"Mitsuba: direct_projective\nrel. L1 error {error(projective):.0%}", "derivative"
+            ),
+            pictures.Panel(reference.mean, f"finite differences\nrel. L1 noise {noise:.0%}", "derivative"),
+        ],
+        title="Derivative of the image when the camera moves to the right (red: brighter, blue: darker)",
+        unit=motion.unit,
+        limit=pictures.symmetric_limit([reference.mean], percentile=97),
+    )
+
+
+if __name__ == "__main__":
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    IMAGES.mkdir(exist_ok=True)
+    overview(IMAGES / "overview.png")

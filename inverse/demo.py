@@ -1,0 +1,266 @@
+"""The demonstration behind ``make demo``: derivative images beside references, a fit, and a page that shows them."""
+
+from __future__ import annotations
+
+import base64
+import gc
+import html
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+import rimlight
+from rimlight import pictures, scenes
+from rimlight.edge_sampling import Motion, derivative_image, finite_differences
+from rimlight.edge_sampling.exr import replacing
+from rimlight.inverse.triangles import VertexFit, fit_vertices
+
+SPP = 256  # samples per pixel of one derivative
+RENDERS = 4  # derivatives to average; the first one pays for the compiler and is not timed
+
+
+@dataclass(frozen=True)
+class Study:
+    """Derivative images of one motion, by several methods."""
+
+    name: str  # of the PNG file
+    scene: str
+    title: str
+    text: str
+    motion: dict[str, Any]  # arguments of `Motion`
+    step: float  # of the finite differences: a few hundredths of a pixel
+    methods: tuple[str, ...] = ("direct_edge", "direct_projective")
+
+
+STUDIES = (
+    Study(
+        "green_vertex",
+        "two_triangles",
+        "The right vertex of the green triangle moves left",
+        "Only the edge that ends in this vertex sweeps over the picture. Blue pixels lose light: what they show of the "
+        "triangle gives way to the dark behind it.",
+        {"key": "green.vertex_positions", "direction": (1, 0, 0), "vertices": [0]},
+        2e-3,
+    ),
+    Study(
+        "red_vertex",
+        "two_triangles",
+        "The right vertex of the red triangle moves left",
+        "The red triangle lies behind the green one. Where green covers its edge, the derivative is zero.",
+        {"key": "red.vertex_positions", "direction": (1, 0, 0), "vertices": [0]},
+        2e-3,
+    ),
+    Study(
+        "cube_depth",
+        "cube",
+        "A cube under a white sky comes closer",
+        "All faces have the same brightness, so that only the outline says that the cube grows: grey replaces white. "
+        "Mitsuba's projective sampling, at its default settings, overestimates it.",
+        {"key": "cube.vertex_positions", "direction": (0, 0, 1)},
+        5e-3,
+    ),
+    Study(
+        "camera",
+        "coloured_cube",
+        "The camera moves upwards before a shining cube",
+        "Every edge moves over the picture, the creases between the colours too. Mitsuba's projective sampling does "
+        "not follow the camera: its derivative is zero.",
+        {"key": "camera.to_world", "direction": (0, 1, 0)},
+        2e-3,
+    ),
+)
+
+#: The start of the fit: the initial guess of redner's test `two_triangles` (figure 6a of Li et al. 2018), at the depth
+#: of the target. The right vertex of the red triangle is hidden behind the green one.
+START = {
+    "green.vertex_positions": ((-1.3, 1.5, 0.0), (1.5, 0.7, 0.0), (-0.8, -1.1, 0.0)),
+    "red.vertex_positions": ((-0.5, 1.2, 1.0), (0.3, 1.7, 1.0), (0.5, -1.8, 1.0)),
+}
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page: a heading, a text, and the pictures below it."""
+
+    title: str
+    text: str
+    files: tuple[str, ...]
+
+
+def main(out: Path | str = "demo") -> None:
+    """Make the page and its pictures in the folder `out`, and print where they are.
+
+    Raises
+    ------
+    OSError : the folder cannot be written to. Nothing of a file is there before it is complete.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)  # the peer's warnings are not about what this page shows
+    start = time.perf_counter()
+    try:
+        sections = []
+        for study in (bar := tqdm(STUDIES, desc="derivatives", disable=None)):
+            bar.set_postfix_str(study.name)
+            sections.append(show_derivatives(study, out))
+        sections.append(show_fit(out))
+    finally:
+        mi.set_log_level(level)
+        _free()
+    write_page(out, sections, time.perf_counter() - start)
+    print(f"Rimlight: open {out / 'index.html'} in a browser; the pictures are beside it.")
+
+
+# ------------------------------------------------------------------ derivatives
+
+
+def show_derivatives(study: Study, out: Path) -> Section:
+    """Compare methods with finite differences, and write one row of pictures."""
+    _free()
+    scene = mi.load_file(str(scenes.path(study.scene)))
+    motion = Motion(scene, **study.motion)
+    panels = [pictures.Panel(np.array(mi.render(scene, spp=SPP)), "image")]
+    reference, seconds = _timed(lambda: finite_differences(scene, motion, step=study.step, runs=16, spp=1024))
+    noise = np.sqrt(2 / np.pi) * reference.standard_error.sum() / np.abs(reference.mean).sum()
+    results = []
+    for method in study.methods:
+        derivative, seconds_each = _derivative(scene, method, motion)
+        error = np.abs(derivative - reference.mean).sum() / np.abs(reference.mean).sum()
+        label = f"Rimlight: {method}" if method == "direct_edge" else f"Mitsuba: {method}"
+        caption = f"{label}\nrel. L1 error {error:.1%}, {seconds_each:.2f} s"
+        panels.append(pictures.Panel(derivative, caption, "derivative"))
+        results.append(f"{method} {error:.1%}")
+    caption = f"finite differences\nrel. L1 noise {noise:.1%}, {seconds:.1f} s"
+    panels.append(pictures.Panel(reference.mean, caption, "derivative"))
+    limit = pictures.symmetric_limit([reference.mean])
+    pictures.write_panels(out / f"{study.name}.png", panels, unit=motion.unit, limit=limit)
+    numbers = f"Errors against finite differences (themselves uncertain by {noise:.1%}): {', '.join(results)}."
+    return Section(study.title, f"{study.text} {numbers}", (f"{study.name}.png",))
+
+
+def _derivative(scene: Any, method: str, motion: Motion) -> tuple[np.ndarray, float]:
+    """Mean of `RENDERS` derivatives, (H, W, C), and the median time of one in seconds."""
+    integrator = mi.load_dict({"type": method})
+    render = lambda seed: np.array(derivative_image(scene, integrator, motion, spp=SPP, seed=seed))  # noqa: E731
+    images, seconds = zip(*(_timed(lambda seed=seed: render(seed)) for seed in range(RENDERS)), strict=True)
+    return np.mean(images, axis=0), float(np.median(seconds[1:]))
+
+
+def _timed(work: Any) -> tuple[Any, float]:
+    start = time.perf_counter()
+    return work(), time.perf_counter() - start
+
+
+# ------------------------------------------------------------------ fit
+
+
+def show_fit(out: Path, *, resolution: int = 128, iterations: int = 200) -> Section:
+    """Fit the six vertices of two triangles to a picture, and write what became of them."""
+    _free()
+    scene = mi.load_file(str(scenes.path("two_triangles")), res=resolution)
+    params = mi.traverse(scene)
+    truth = {key: np.array(params[key]).reshape(-1, 3) for key in START}
+    target = np.array(mi.render(scene, spp=1024, seed=1000))
+    for key, vertices in START.items():
+        params[key] = mi.Float(np.ravel(vertices).astype(np.float32))
+    params.update()
+    before = np.array(mi.render(scene, spp=SPP, seed=1001))
+    fit, seconds = _timed(
+        lambda: fit_vertices(scene, list(START), target, iterations=iterations, axes="xy", final_spp=SPP)
+    )
+
+    errors = vertex_errors(fit, truth, resolution)
+    rmse = [float(np.sqrt(np.mean((image - target) ** 2))) for image in (before, fit.image)]
+    panels = [
+        pictures.Panel(before, f"start\nfarthest vertex {errors[0]:.1f} pixels off"),
+        pictures.Panel(fit.image, f"after {iterations} steps\nfarthest vertex {errors[-1]:.2f} pixels off"),
+        pictures.Panel(target, "target"),
+        pictures.Panel(fit.image - target, "result - target", "derivative"),
+    ]
+    pictures.write_panels(out / "fit.png", panels)
+    curves = {"error of the farthest vertex (pixels)": errors, "loss (mean squared difference)": fit.losses}
+    pictures.write_curves(out / "fit_curves.png", curves, x="step", y="")
+    text = (
+        f"Two triangles are pulled from a wrong start into the pose that a picture shows, in {iterations} steps of "
+        f"Adam at 4 samples per pixel ({seconds:.0f} s). At the start the right vertex of the red triangle is hidden "
+        "behind the green one; the parts of its edges that can be seen bring it out. The error of the farthest vertex "
+        f"falls from {errors[0]:.1f} to {errors[-1]:.2f} pixels, the root mean square difference of the pictures from "
+        f"{rmse[0]:.4f} to {rmse[1]:.4f}. The loss levels off at the noise of 4 samples. Depth is held: one picture "
+        "tells next to nothing about it."
+    )
+    return Section("Six vertices fitted to a picture", text, ("fit.png", "fit_curves.png"))
+
+
+def vertex_errors(fit: VertexFit, truth: dict[str, np.ndarray], resolution: int) -> np.ndarray:
+    """Distance of the farthest vertex from its place in the picture: (iterations + 1,), pixels.
+
+    truth : key -> (V, 3), world space. resolution : width of the picture, pixels.
+    """
+    focal_length = resolution / (2 * np.tan(np.radians(45 / 2)))  # pixels; the camera stands at z = -5
+    film = lambda p: focal_length * p[..., :2] / (p[..., 2:] + 5)  # noqa: E731
+    distances = [np.linalg.norm(film(fit.history[key]) - film(truth[key]), axis=-1) for key in truth]
+    return np.concatenate(distances, axis=1).max(1)
+
+
+def _free() -> None:
+    """Forget scenes and kernels: Dr.Jit 1.5 aborts ("invalid redefinition of function") with those of many scenes."""
+    gc.collect()
+    dr.flush_kernel_cache()
+    dr.flush_malloc_cache()
+
+
+# ------------------------------------------------------------------ page
+
+STYLE = """
+body { max-width: 74rem; margin: 2rem auto; padding: 0 1.5rem; font: 17px/1.55 system-ui, sans-serif; color: #1c2530; }
+h1 { font-size: 1.9rem; margin-bottom: 0; }
+h2 { font-size: 1.25rem; margin: 2.6rem 0 .2rem; }
+p { max-width: 46rem; margin: .4rem 0 .8rem; }
+img { max-width: 100%; display: block; }
+footer { margin-top: 3rem; color: #66707c; font-size: .85rem; }
+"""
+
+INTRODUCTION = (
+    "What happens to a picture when an object moves? At its outline a pixel jumps from one colour to another, and "
+    "automatic differentiation sees nothing there. Rimlight adds the missing term to Mitsuba 3 by sampling the edges "
+    "themselves. Below, red pixels get brighter and blue ones darker; finite differences, slow but impartial, are the "
+    "reference."
+)
+
+
+def write_page(out: Path, sections: list[Section], seconds: float) -> None:
+    """Write index.html, with all pictures inside."""
+    parts = []
+    for section in sections:
+        images = "\n".join(_image(out / file, section.title) for file in section.files)
+        parts.append(
+            f"<section>\n<h2>{html.escape(section.title)}</h2>\n<p>{html.escape(section.text)}</p>\n{images}\n</section>"
+        )
+    footer = (
+        f"Rimlight {rimlight.__version__}, Mitsuba {mi.__version__}, Dr.Jit {dr.__version__}, "
+        f"{dr.thread_count()} threads; made in {seconds:.0f} s. Times are those of one derivative at {SPP} samples per "
+        f"pixel, compiled; errors are those of the mean of {RENDERS}."
+    )
+    page = (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width">\n<title>Rimlight: derivatives of pictures</title>\n'
+        f"<style>{STYLE}</style>\n</head>\n<body>\n<h1>Rimlight</h1>\n<p>{INTRODUCTION}</p>\n"
+        + "\n".join(parts)
+        + f"\n<footer>{html.escape(footer)}</footer>\n</body>\n</html>\n"
+    )
+    with replacing(out / "index.html") as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _image(file: Path, text: str) -> str:
+    data = base64.b64encode(file.read_bytes()).decode("ascii")
+    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
