@@ -3,8 +3,9 @@
 import sys
 from pathlib import Path
 
-import rimlight
 import mitsuba
+
+import rimlight
 
 # The API pages import modules whose annotations need a variant
 mitsuba.set_variant("llvm_ad_rgb")

@@ -1,6 +1,6 @@
 """Make the pictures of the README and the documentation:  python docs/make_images.py
 
-About three minutes on two cores. Writes docs/images/overview.png.
+About five minutes on two cores. Writes docs/images/overview.png.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ IMAGES = Path(__file__).parent / "images"
 RES = 160
 
 #: Samples per pixel of a launch, and launches, of the derivative images.
-SPP, LAUNCHES = 64, 32
+SPP, LAUNCHES = 64, 128
 
 #: Step (scene units), runs and samples per pixel of the finite differences.
 STEP, RUNS, REFERENCE_SPP = 1e-3, 8, 1024

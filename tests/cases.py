@@ -131,7 +131,7 @@ def split_cube():
     return mesh("cube", v, np.arange(len(v)).reshape(-1, 3), bsdf=diffuse(0.5))
 
 
-def coloured_cube() -> mi.Scene:
+def coloured_cube(sensor: Callable[[], dict] = camera, **more: Any) -> mi.Scene:
     """Six emitting faces of different colours, which share their vertices' places, but not their vertices."""
     v, colours = cube_vertices(), [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (0, 1, 1), (1, 0, 1)]
     faces = {}
@@ -139,7 +139,7 @@ def coloured_cube() -> mi.Scene:
         corners = sorted({c for t in CUBE_FACES[2 * i : 2 * i + 2] for c in t})
         local = [[corners.index(c) for c in t] for t in CUBE_FACES[2 * i : 2 * i + 2]]
         faces[f"face{i}"] = mesh(f"face{i}", v[corners], local, bsdf=diffuse(0.0), emitter=light(*colour))
-    return scene(sensor=camera(), **faces)
+    return scene(sensor=sensor(), **faces, **more)
 
 
 def texture() -> dict:

@@ -1,4 +1,4 @@
-"""Docstrings of this project as reStructuredText: NumPy's sections, and lines of the form ``name : meaning`` outside of them."""
+"""Docstrings of this project as reStructuredText: NumPy's sections, and lines of the form ``name : meaning``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ENTRY = re.compile(r"[A-Za-z_]\w*(, [A-Za-z_]\w*)*\s+: ")
 
 
 def convert(lines: list[str]) -> list[str]:
-    """Sections become rubrics, entries become definition lists. Everything else is kept, its symbols taken literally."""
+    """Sections become rubrics, entries become definition lists. All else is kept, its symbols taken literally."""
     out: list[str] = []
     in_entry = False
     for line, following in zip(lines, [*lines[1:], ""], strict=True):
@@ -20,7 +20,7 @@ def convert(lines: list[str]) -> list[str]:
         if RULE.match(following):
             out += ["", f".. rubric:: {line}", ""]
             in_entry = False
-        elif match := ENTRY.match(line):
+        elif ENTRY.match(line):
             name, _, meaning = line.partition(" : ")
             names = ", ".join(f"``{n.strip()}``" for n in name.split(","))
             out += [*([] if in_entry or not out or not out[-1] else [""]), names, f"    {literal(meaning)}"]
@@ -53,5 +53,3 @@ def _process(app: Sphinx, what: str, name: str, obj: object, options: object, li
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", _process)
     return {"parallel_read_safe": True}
-
-

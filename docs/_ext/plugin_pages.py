@@ -1,17 +1,16 @@
 """Manual pages from the docstrings of plugins, which are written with the directives of Mitsuba's own manual.
 
-``.. plugin-page:: integrator direct_edge`` inserts the page of a plugin. Known inside of it: ``pluginparameters``, ``tabs`` with
+``.. plugin-page:: direct_edge`` inserts the page of a plugin. Known inside of it: ``pluginparameters``, ``tabs`` with
 ``code-tab``, ``:monosp:``, and the substitutions ``|int|`` etc.
 """
 
 from __future__ import annotations
 
 import inspect
-from typing import ClassVar
 
 import mitsuba as mi
 from docutils import nodes
-from docutils.parsers.rst import Directive, directives
+from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
@@ -22,12 +21,12 @@ FLAGS = {"exposed": "P", "differentiable": "∂", "discontinuous": "D"}
 
 
 class PluginPage(SphinxDirective):
-    """Insert the docstring of a plugin's class. Arguments: kind (``integrator``, ...) and name of the plugin."""
+    """Insert the docstring of a plugin's class. The argument is its name."""
 
-    required_arguments = 2
+    required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        _, name = self.arguments
+        (name,) = self.arguments
         plugin = mi.load_dict({"type": name})
         source = inspect.getsourcefile(type(plugin)) or name
         self.env.note_dependency(source)
@@ -61,26 +60,30 @@ class PluginParameters(Directive):
 
 
 class CodeTab(Directive):
-    """One of the tabs below ``tabs``: a block of code with its language above."""
+    """A block of code in a tab. The argument is its language."""
 
     has_content = True
     required_arguments = 1
-    option_spec: ClassVar = {"name": directives.unchanged}
 
     def run(self) -> list[nodes.Node]:
-        code = "\n".join(self.content)
         language = self.arguments[0]
-        title = nodes.paragraph("", "", nodes.strong(text={"xml": "XML", "python": "Python"}.get(language, language)))
-        return [title, nodes.literal_block(code, code, language=language)]
+        title = {"xml": "XML", "python": "Python"}.get(language, language)
+        code = [f"        {line}" for line in self.content]
+        lines = [f".. tab:: {title}", "", f"    .. code-block:: {language}", "", *code]
+        container = nodes.Element()
+        self.state.nested_parse(StringList(lines, source="code-tab"), self.content_offset, container)
+        return container.children
 
 
 class Tabs(Directive):
+    """A group of ``code-tab``."""
+
     has_content = True
 
     def run(self) -> list[nodes.Node]:
-        body = nodes.container()
-        self.state.nested_parse(self.content, self.content_offset, body)
-        return [body]
+        container = nodes.Element()
+        self.state.nested_parse(self.content, self.content_offset, container)
+        return container.children
 
 
 def monosp(role, rawtext, text, lineno, inliner, options=None, content=None):

@@ -1,0 +1,270 @@
+"""`direct_edge`: agreement with `path`, consistency of its modes and terms, refusals."""
+
+import cases
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import rimlight.scenes
+from rimlight.edge_sampling import Motion, derivative_image
+from rimlight.edge_sampling.exr import read_exr
+from zscores import mean_and_error, z_scores
+
+
+@pytest.fixture(autouse=True)
+def forget_kernels(free_memory):
+    yield
+    dr.flush_kernel_cache()
+
+
+def integrator(**options):
+    return mi.load_dict({"type": "direct_edge", **options})
+
+
+def jacobian_times(scene, motion, spp=16, seed=3, **options):
+    return np.array(derivative_image(scene, integrator(**options), motion, spp=spp, seed=seed), np.float64)
+
+
+def gradient(scene, motion, weights, spp=16, seed=3, **options):
+    """dθ of Σ weights · image, through backward mode."""
+    theta = mi.Float(0)
+    dr.enable_grad(theta)
+    motion.apply(theta)
+    value = motion.params[motion.key]
+    integrator(**options).render_backward(scene, motion.params, mi.TensorXf(weights), seed=seed, spp=spp)
+    dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)
+    motion.apply(0.0)
+    return dr.grad(theta)[0]
+
+
+# ---------------------- Primal ----------------------
+
+
+@pytest.mark.parametrize("name", rimlight.scenes.names())
+def test_image_agrees_with_the_stored_reference(name, root):
+    """z-test against `path` at depth 2: tests/references/images/*.exr, made by make_images.py."""
+    layers, _ = read_exr(root / "tests" / "references" / "images" / f"{name}.exr")
+    scene = mi.load_file(str(rimlight.scenes.path(name)), res=cases.RES)
+    images = np.array([mi.render(scene, integrator=integrator(), spp=64, seed=i) for i in range(32)], np.float64)
+    z = z_scores(*mean_and_error(images), layers[""], layers["standard_error"])
+    assert np.isfinite(z).all()
+    assert np.abs(z).max() < 5
+    assert np.mean(z**2) < 1.2
+
+
+@pytest.mark.parametrize("hide", [False, True])
+def test_image_equals_path_with_hidden_emitters(hide):
+    scene = cases.room(lambda: cases.camera((0, 2, -6), (0, 1.5, 0), film=cases.film(pixel_format="rgba")))()
+    path = mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": hide})
+    ours = np.array(mi.render(scene, integrator=integrator(hide_emitters=hide), spp=1024))
+    theirs = np.array(mi.render(scene, integrator=path, spp=1024, seed=1))
+    assert np.abs(ours[..., 3] - theirs[..., 3]).max() < 0.1
+    assert np.abs(ours - theirs).mean() < 0.02 * theirs.mean()
+
+
+def test_boundary_samples_do_not_touch_the_image():
+    scene = cases.cube()()
+    with_boundary = mi.render(scene, integrator=integrator(), spp=4)
+    without = mi.render(scene, integrator=integrator(sppp=0, sppi=0), spp=4)
+    assert (np.array(with_boundary) == np.array(without)).all()
+
+
+# ---------------------- Consistency ----------------------
+
+
+@pytest.mark.parametrize("name", ["two_triangles_green", "cube_depth", "room_light", "thin_lens_camera", "gaussian_filter", "crop_window"])
+def test_forward_and_backward_agree(name):
+    case = cases.case(name)
+    scene = case.scene()
+    motion = Motion(scene, **case.motion)
+    J = jacobian_times(scene, motion)
+    weights = np.random.default_rng(0).normal(size=J.shape).astype(np.float32)
+    assert gradient(scene, motion, weights) == pytest.approx((weights * J).sum(), rel=1e-3)
+
+
+def test_mi_render_differentiates_both_ways():
+    case = cases.case("room_camera")
+    scene = case.scene()
+    motion = Motion(scene, **case.motion)
+    theta = mi.Float(0)
+    dr.enable_grad(theta)
+    motion.apply(theta)
+    image = mi.render(scene, motion.params, integrator=integrator(), spp=16, seed=0)
+    dr.backward(dr.sum(image, axis=None))
+    motion.apply(0.0)
+    seed_grad = mi.sample_tea_32(0, 1)[0]
+    expected = np.array(derivative_image(scene, integrator(), motion, spp=16, seed=seed_grad), np.float64).sum()
+    assert dr.grad(theta)[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_terms_add_up():
+    case = cases.case("room_cube")
+    scene = case.scene()
+    motion = Motion(scene, **case.motion)
+    terms = [{"sppp": 0, "sppi": 0}, {"sppc": 0, "sppi": 0}, {"sppc": 0, "sppp": 0}]
+    parts = [jacobian_times(scene, motion, **options) for options in terms]
+    assert all(np.abs(p).sum() > 0 for p in parts)
+    total = jacobian_times(scene, motion)
+    assert np.abs(sum(parts) - total).max() < 1e-4 * np.abs(total).max()
+
+
+@pytest.fixture
+def one_thread():
+    """Sums then have one order only: with several, atomic additions leave the last bits to chance."""
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(threads)
+
+
+@pytest.mark.parametrize("key", ["face0.vertex_positions", "sensor.to_world"])
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_object_behind_the_camera_changes_nothing_at_all(key, rfilter, one_thread):
+    """The faces of the cube emit and reflect nothing, so that nothing behind the camera matters to them."""
+    images = []
+    for extra in ({}, {"a_behind": cases.mesh("a_behind", [[0, 3, -9], [1, 3, -9], [0, 4, -9.5]], [[0, 1, 2]], bsdf=cases.diffuse(0.5))}):
+        scene = cases.coloured_cube(lambda: cases.camera(film=cases.film(rfilter)), **extra)
+        images.append(jacobian_times(scene, Motion(scene, key, direction=[1, 0, 0]), sppi=0))
+    assert np.abs(images[0]).sum() > 0
+    assert (images[0] == images[1]).all()
+
+
+def test_split_vertices_change_nothing():
+    images = []
+    for shape in (cases.welded_cube, cases.split_cube):
+        scene = cases.cube(shape=shape)()
+        images.append(jacobian_times(scene, Motion(scene, **cases.DEPTH), spp=64))
+    assert np.abs(images[0] - images[1]).sum() < 1e-4 * np.abs(images[0]).sum()
+
+
+def test_gradient_reaches_both_copies_of_a_split_vertex():
+    scene = cases.cube(shape=cases.split_cube)()
+    params = mi.traverse(scene)
+    key = "cube.vertex_positions"
+    dr.enable_grad(params[key])
+    params.update()
+    dr.backward(dr.sum(mi.render(scene, params, integrator=integrator(), spp=64), axis=None))
+    position = np.array(params[key]).reshape(-1, 3)
+    g = np.array(dr.grad(params[key])).reshape(-1, 3)
+    _, place = np.unique(position.round(5), axis=0, return_inverse=True)
+    touched = np.abs(g).max(1) > 0
+    assert np.isfinite(g).all()
+    assert max(np.count_nonzero(touched[place.ravel() == i]) for i in range(8)) > 1
+
+
+def test_without_interior_samples_the_filter_still_normalises():
+    scene = cases.cube(lambda: cases.camera(film=cases.film("gaussian")))()
+    motion = Motion(scene, **cases.SIDE)
+    whole = np.mean([jacobian_times(scene, motion, spp=64, seed=i, sppi=0) for i in range(8)], 0)
+    boundary = np.mean([jacobian_times(scene, motion, spp=64, seed=i, sppc=0, sppi=0) for i in range(8)], 0)
+    # Under a constant environment, and translated, a convex cube of one colour has no interior derivative.
+    assert np.abs(whole - boundary).sum() < 0.03 * np.abs(whole).sum()
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_other_variants_agree_with_rgb(variant):
+    rgb = average_derivative()
+    mi.set_variant(variant)
+    try:
+        other = average_derivative()
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+    assert np.abs(other - rgb).sum() < 0.05 * np.abs(rgb).sum()
+
+
+def average_derivative() -> np.ndarray:
+    """Summed over channels; grey scene, so that mono and spectral rendering mean the same."""
+    scene = cases.cube(lambda: cases.camera(film=cases.film(pixel_format="luminance")))()
+    motion = Motion(scene, **cases.DEPTH)
+    return np.mean([jacobian_times(scene, motion, spp=64, seed=i, sppi=0) for i in range(8)], 0)
+
+
+def test_alpha_has_a_derivative():
+    scene = cases.scene(sensor=cases.camera(film=cases.film(pixel_format="rgba")), cube=cases.welded_cube())
+    motion = Motion(scene, **cases.SIDE)
+    images = [mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=4096)]
+    J = np.mean([jacobian_times(scene, motion, spp=256, seed=i) for i in range(4)], 0)[..., 3]
+    for theta in (0.02, -0.02):
+        motion.apply(theta)
+        images.append(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=4096))
+    expected = (np.array(images[1]) - np.array(images[2]))[..., 3] / 0.04
+    assert np.abs(J - expected).sum() < 0.1 * np.abs(expected).sum()
+
+
+# ---------------------- Refusals and warnings ----------------------
+
+
+def moving(scene, key, **motion):
+    return derivative_image(scene, integrator(), Motion(scene, key, **motion), spp=4)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "disk", "cylinder"])
+def test_shapes_without_edges_must_stand_still(shape):
+    scene = cases.cube(thing=lambda: {"type": shape, "id": "thing", "to_world": mi.ScalarTransform4f().translate([0, 2, 0])})()
+    with pytest.raises(RuntimeError, match=rf'shape "thing" \({shape.capitalize()}\) moves'):
+        moving(scene, "thing.to_world", direction=[1, 0, 0])
+    with pytest.raises(RuntimeError, match='camera moves past "thing"'):
+        moving(scene, "sensor.to_world", direction=[1, 0, 0])
+    assert np.isfinite(np.array(moving(scene, "cube.vertex_positions", direction=[1, 0, 0]))).all()
+
+
+def test_instances_must_stand_still():
+    group = {"type": "shapegroup", "inner": cases.smooth_cube()}
+    scene = cases.scene(sensor=cases.camera(), group=group, copy={"type": "instance", "id": "copy", "r": {"type": "ref", "id": "group"}}, environment=cases.constant())
+    with pytest.raises(RuntimeError, match=r'shape "copy" \(Instance\) moves'):
+        moving(scene, "copy.to_world", direction=[1, 0, 0])
+
+
+def test_negative_sample_count_is_refused():
+    with pytest.raises(RuntimeError, match='direct_edge: "sppi" must be a whole number >= 0, got -4'):
+        integrator(sppi=-4)
+
+
+def test_polarised_variants_are_refused():
+    mi.set_variant("llvm_ad_spectral_polarized")
+    try:
+        with pytest.raises(RuntimeError, match="polarised variants are not supported"):
+            integrator()
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+
+
+def warnings_of(scene, key, options, **motion) -> str:
+    messages = []
+
+    class Collect(mi.Appender):
+        def append(self, level, text):
+            messages.append(text)
+
+        def log_progress(self, *args):
+            pass
+
+    appender = Collect()
+    logger = mi.logger()
+    logger.add_appender(appender)
+    try:
+        it = integrator(**options)
+        for _ in range(2):
+            derivative_image(scene, it, Motion(scene, key, **motion), spp=1)
+    finally:
+        logger.remove_appender(appender)
+    return "\n".join(m for m in messages if "direct_edge" in m)
+
+
+def test_limits_are_warned_about_once():
+    lamp = lambda: {"type": "point", "position": [0, 4, 0], "intensity": {"type": "rgb", "value": 5.0}}
+    mirror = lambda: {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, -2, 0]), "bsdf": {"type": "conductor"}}
+    board = lambda: {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, -3, 0]), "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
+    scene = cases.cube(lamp=lamp, mirror=mirror, board=board)()
+    text = warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
+    for part in ("hard shadows of point", "perfect mirrors", "jumps of the textures"):
+        assert text.count(part) == 1
+    quiet = warnings_of(scene, "cube.vertex_positions", {"sppi": 0}, direction=[1, 0, 0])
+    assert "hard shadows" not in quiet
+
+
+def test_a_scene_that_does_not_move_is_a_mistake():
+    scene = cases.cube()()
+    with pytest.raises(RuntimeError, match="does not depend on the input"):
+        integrator().render_forward(scene, mi.traverse(scene), spp=1)

@@ -1,0 +1,129 @@
+"""The documentation is true: its Python runs, its scenes load, its command lines parse, its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
+
+BLOCK = re.compile(
+    r"(?P<skip><!-- skip: [^>]+-->\s*)?^(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)^ *```$",
+    re.DOTALL | re.MULTILINE,
+)
+
+#: What precedes the blocks of a page: warnings are errors here, too.
+PROLOGUE = "import warnings\nwarnings.simplefilter('error')\n"
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of code.
+
+    line : of its first line of code, from 1.
+    """
+
+    language: str
+    code: str
+    line: int
+
+
+def blocks(text: str) -> list[Block]:
+    """The blocks of a page that are not preceded by ``<!-- skip: reason -->``."""
+    return [
+        Block(m["language"], textwrap.dedent(m["code"]), text.count("\n", 0, m.start("code")) + 1)
+        for m in BLOCK.finditer(text)
+        if not m["skip"]
+    ]
+
+
+def program(page: Path, found: list[Block]) -> str:
+    """The Python and XML blocks of a page as one program, in one namespace. Errors name the lines of the page."""
+    parts = [PROLOGUE]
+    for block in found:
+        if block.language == "python":
+            code = "\n" * (block.line - 1) + block.code
+            parts.append(f"exec(compile({code!r}, {str(page)!r}, 'exec'))")
+        elif block.language == "xml":
+            parts.append("import rimlight, mitsuba\nmitsuba.set_variant('llvm_ad_rgb')")
+            parts.append(f"mitsuba.load_string({block.code!r})")
+    return "\n".join(parts)
+
+
+def commands(text: str) -> list[str]:
+    """Command lines of `rimlight` in the blocks for the shell."""
+    lines = [line.strip() for block in blocks(text) if block.language == "sh" for line in block.code.splitlines()]
+    return [line for line in lines if line.startswith("rimlight ")]
+
+
+def read(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+PROGRAMS = [p for p in PAGES if any(b.language in ("python", "xml") for b in blocks(read(p)))]
+COMMANDS = sorted({line for page in PAGES for line in commands(read(page))})
+
+
+@pytest.mark.parametrize("page", PROGRAMS, ids=lambda p: p.name)
+def test_snippets_run(page, tmp_path):
+    script = tmp_path / "snippets.py"
+    script.write_text(program(page, blocks(read(page))), encoding="utf-8")
+    result = subprocess.run([sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    assert result.returncode == 0, result.stderr[-3000:]
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_command_lines_parse(line):
+    """Options and their values are known, and files that are named exist. Nothing is run."""
+    import tyro
+
+    from rimlight.cli._commands import COMMANDS as KNOWN
+
+    arguments = shlex.split(line)[1:]
+    command = tyro.extras.subcommand_cli_from_dict(KNOWN, args=arguments)
+    scene = getattr(command, "scene", None)
+    assert scene is None or (ROOT / scene).is_file()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page):
+    """Relative links and pictures of Markdown, included files, and referenced pages."""
+    text = re.sub(r"```(?:python|xml|sh).*?```", "", read(page), flags=re.DOTALL)
+    targets = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
+    targets += re.findall(r"^```\{(?:include|image)\} (\S+)", text, re.MULTILINE)
+    targets += [f"{name}.md" for name in re.findall(r"\{doc\}`(\w+)`", text)]
+    missing = [target for target in targets if not (page.parent / target).exists()]
+    assert not missing
+
+
+def test_there_is_something_to_test():
+    assert {"README.md", "getting_started.md", "extending.md"} <= {p.name for p in PROGRAMS}
+    assert any(b.language == "xml" for b in blocks(read(ROOT / "README.md")))
+    assert len(COMMANDS) >= 5
+
+
+def test_blocks_are_found():
+    text = (
+        "```python\na = 1\n```\n\n"
+        "1. item:\n\n   ```sh\n   rimlight demo\n   ```\n\n"
+        "<!-- skip: takes an hour -->\n```python\nraise SystemExit(1)\n```\n"
+        "```{eval-rst}\nno code\n```\n"
+    )
+    assert blocks(text) == [Block("python", "a = 1\n", 2), Block("sh", "rimlight demo\n", 8)]
+    assert commands(text) == ["rimlight demo"]
+
+
+def test_a_failing_snippet_is_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    source = program(page, blocks("text\n\n```python\na = 1\n```\n```python\nassert a == 2\n```\n"))
+    result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True)
+    assert result.returncode != 0
+    assert f'{page}", line 7' in result.stderr

@@ -1,0 +1,107 @@
+"""Edges: welding, adjacency, classification."""
+
+import time
+
+import cases
+import mitsuba as mi
+import numpy as np
+import pytest
+from rimlight.edge_sampling import EdgeKind, Geometry, find_edges
+
+
+def edges_of(*meshes):
+    return find_edges(Geometry(tuple(meshes), ()))
+
+
+def grid(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """A wavy sheet of n × n vertices."""
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    vertices = np.stack([x, y, np.sin(3 * x) * np.cos(2 * y)], -1).reshape(-1, 3)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel()
+    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+
+
+def test_cube_has_18_edges_however_it_is_stored():
+    for shape in (cases.welded_cube(), cases.split_cube()):
+        edges = edges_of(shape)
+        assert len(edges) == 18
+        assert (edges.kind == EdgeKind.FLAT).all()
+        assert not edges.open.any()
+
+
+def test_split_vertices_name_both_copies():
+    edges = edges_of(cases.split_cube())
+    assert (edges.vertices[:, 0] != edges.vertices[:, 1]).all()
+    position = np.array(cases.split_cube().vertex_positions_buffer()).reshape(-1, 3)
+    assert np.allclose(position[edges.vertices[:, 0]], position[edges.vertices[:, 1]])
+
+
+def test_rectangle_has_four_open_edges():
+    edges = edges_of(mi.load_dict({"type": "rectangle"}))
+    assert edges.open.sum() == 4
+    assert (edges.kind[edges.open] == EdgeKind.JUMP).all()
+    assert len(edges) == 5
+
+
+def test_sides_of_an_edge_share_its_end_points():
+    vertices, faces = grid(8)
+    edges = edges_of(cases.mesh("sheet", vertices, faces))
+    assert (edges.vertices[:, 0] == edges.vertices[:, 1]).all()
+    assert (edges.opposite[~edges.open, 0] != edges.opposite[~edges.open, 1]).all()
+    assert len(edges) == 7 * 8 * 2 + 49  # Euler: V − E + F = 1
+    assert edges.open.sum() == 28
+
+
+def test_interpolated_normals_leave_silhouettes_only():
+    edges = edges_of(cases.torus())
+    assert (edges.kind == EdgeKind.SMOOTH).all()
+
+
+def test_degenerate_and_repeated_triangles_are_ignored():
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]]
+    clean = edges_of(cases.mesh("clean", vertices, [[0, 1, 2], [1, 3, 2]]))
+    messy = edges_of(cases.mesh("messy", vertices, [[0, 1, 2], [1, 3, 2], [2, 1, 0], [0, 1, 2], [1, 1, 2], [3, 3, 3]]))
+    assert messy.summary() == clean.summary()
+
+
+def test_fan_of_three_faces_jumps():
+    vertices = [[0, 0, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0.2], [0, 0, 1]]
+    edges = edges_of(cases.mesh("fan", vertices, [[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
+    assert len(edges) == 7
+    assert (edges.kind == EdgeKind.JUMP).all()
+
+
+def test_edges_of_two_meshes_that_coincide_are_one():
+    """Even if their coordinates differ by rounding, as after two transformations."""
+    left = cases.mesh("left", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    shift = np.float32(1e-7)
+    right = cases.mesh("right", [[1, 0, 0], [1 + shift, 1, 0], [shift, 1, 0]], [[0, 1, 2]])
+    edges = edges_of(left, right)
+    assert len(edges) == 5
+    assert (edges.mesh[:, 0] != edges.mesh[:, 1]).sum() == 1
+    assert (edges.kind == EdgeKind.JUMP).all()
+
+
+def test_texture_seam_jumps():
+    sphere = mi.load_dict({"type": "cube"})
+    seams = edges_of(sphere)
+    assert (seams.kind == EdgeKind.JUMP).sum() == 12
+
+
+def test_vertices_that_are_not_finite_are_refused():
+    with pytest.raises(ValueError, match='"bad": 1 vertices are not finite'):
+        edges_of(cases.mesh("bad", [[0, 0, 0], [1, np.nan, 0], [0, 1, 0]], [[0, 1, 2]]))
+
+
+def test_scene_without_meshes_has_no_edges():
+    assert len(edges_of()) == 0
+
+
+def test_a_million_triangles():
+    vertices, faces = grid(708)
+    sheet = cases.mesh("sheet", vertices, faces)
+    start = time.perf_counter()
+    edges = edges_of(sheet)
+    print(f"{len(faces)} triangles: {time.perf_counter() - start:.2f} s")
+    assert len(edges) == 3 * 707**2 + 2 * 707
