@@ -33,7 +33,7 @@ bibtex_reference_style = "author_year"
 
 html_theme = "furo"
 html_theme_options = {"sidebar_hide_name": False}
-html_show_sphinx = False
+html_show_sphinx = html_show_copyright = False
 exclude_patterns = ["_build", "performance/*"]  # tables that index pages include
 math_eqref_format = "({number})"
 math_numfig = False

@@ -26,7 +26,7 @@ class DeviceEdges:
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
-        """End points of edges, world space. Where vertices are split, the mean of the two sides: each receives its share of the gradient."""
+        """End points of edges, world space; of split vertices the mean, so that all copies have a gradient."""
         a, b = self._points_of_side(positions, edge, 0)
         if self._any_split:
             c, d = self._points_of_side(positions, edge, 1)
@@ -50,7 +50,8 @@ class DeviceEdges:
 
         eye, view : the point that looks, or the direction in which an orthographic sensor does.
         radius : of a lens around the eye: silhouettes from any of its points are taken.
-        geometry : where given, creases between faces that are both visible count, too (they matter for radiance, not for occlusion).
+        geometry : where given, creases between faces that are both visible count, too (they matter for radiance, not
+            for occlusion).
         """
         kind = dr.gather(mi.UInt32, self._kind, edge)
         boundary = kind == int(EdgeKind.JUMP)
@@ -61,7 +62,8 @@ class DeviceEdges:
         normal, sign = [], []
         for opposite in self._opposite:
             o = dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, opposite, edge))
-            # Both normals turn about the edge in the same sense: seen edge-on from both sides, faces that overlap have equal signs.
+            # Both normals turn about the edge in the same sense: seen edge-on from both sides, faces that overlap have
+            # equal signs.
             normal.append(dr.cross(b - a, o - a))
             sign.append(dr.dot(normal[-1], towards))
             # Rounding, and a lens that sees around the edge, leave the sign open: such an edge is taken.

@@ -17,8 +17,8 @@ from .meshes import Geometry
 class EdgeKind(IntEnum):
     """What makes an edge a boundary of the image.
 
-    JUMP   : always: it has one face only, or more than two, or what lies on its two sides differs (shape, texture coordinates,
-             attributes).
+    JUMP   : always: it has one face only, or more than two, or its two sides differ in shape, texture coordinates or
+             attributes.
     FLAT   : as a silhouette, and where its faces are not coplanar: the shading normal is that of the face.
     SPLIT  : as a silhouette, and where the vertex normals of its two sides differ.
     SMOOTH : as a silhouette only.
@@ -32,11 +32,11 @@ class EdgeKind(IntEnum):
 
 @dataclass(frozen=True)
 class Edges:
-    """Topology of the edges of all meshes of a scene, on the host. Positions are not stored: they change, this does not.
+    """Topology of the edges of all meshes of a scene, on the host. Positions change, and are not stored.
 
-    Vertex indices refer to `Geometry.positions`, that is, to the original vertices, not to welded ones. An edge has two sides.
-    Where exporters have split the vertices, the sides name different vertices at the same place; a side that is missing
-    (an open edge) repeats the other.
+    Vertex indices refer to `Geometry.positions`, that is, to the original vertices, not to welded ones. An edge has
+    two sides. Where exporters have split the vertices, these name different vertices at the same place; a side that is
+    missing (an open edge) repeats the other.
 
     vertices : (E, 2, 2), uint32; `[e, side]` = the two end points.
     opposite : (E, 2), uint32; the third vertex of the face on each side.
@@ -70,11 +70,15 @@ class Edges:
 def find_edges(geometry: Geometry) -> Edges:
     """Find and classify the edges of all meshes, as one welded whole.
 
-    Welding over the borders of meshes makes one edge of two that coincide, as where the walls of a room meet: sampled as two, its
-    jump would count twice. Triangles that are degenerate after welding, and repeated triangles, are ignored. A vertex that is not finite
-    raises ValueError.
+    Welding over the borders of meshes makes one edge of two that coincide, as where the walls of a room meet: sampled
+    as two, its jump would count twice. Triangles that are degenerate after welding, and repeated triangles, are
+    ignored.
+
+    Raises
+    ------
+    ValueError : a vertex is not finite.
     """
-    face_list, mesh_of_face, uv, uv_offset = [], [], [], []
+    face_list, mesh_of_face, uv = [], [], []
     points, offset = [], 0
     for i, mesh in enumerate(geometry.meshes):
         f, v = meshes.faces(mesh), meshes.vertices(mesh)
@@ -93,7 +97,7 @@ def find_edges(geometry: Geometry) -> Edges:
 
     weld = _weld_equal(point)
     sides = _pair_sides(weld, face)
-    # Coordinates that went through different transformations differ in their last bits. Only open edges can be concerned.
+    # Coordinates that went through different transformations differ in their last bits; open edges alone can show it.
     rewelded = _weld_close(point, weld, face, sides)
     if rewelded is not weld:
         weld, sides = rewelded, _pair_sides(rewelded, face)
@@ -122,15 +126,14 @@ def find_edges(geometry: Geometry) -> Edges:
 
 
 def _no_edges() -> Edges:
-    return Edges(
-        np.zeros((0, 2, 2), np.uint32), np.zeros((0, 2), np.uint32), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), np.zeros(0, bool)
-    )  # fmt: skip
+    none = np.zeros((0, 2), np.uint32)
+    return Edges(np.zeros((0, 2, 2), np.uint32), none, none, np.zeros(0, np.uint8), np.zeros(0, bool))
 
 
 def _weld_equal(point: np.ndarray) -> np.ndarray:
     """Number the distinct positions: (V,), int64. Adding zero makes +0 and -0 the same bits."""
     bits = (point + np.float32(0)).view(np.uint32).astype(np.uint64)
-    # Sorting one integer a row is several times faster than sorting rows: mix the three, and check below that nothing collided.
+    # To sort one integer a row is several times faster than to sort rows: mix the three, and check for collisions.
     mixed = (
         bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
         ^ bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -145,7 +148,9 @@ def _weld_equal(point: np.ndarray) -> np.ndarray:
 def _mix(rows: np.ndarray) -> np.ndarray:
     """Hash the three columns of `rows` (uint64) into one."""
     a, b, c = rows.T
-    return (a * np.uint64(0x9E3779B97F4A7C15)) ^ (b * np.uint64(0xC2B2AE3D27D4EB4F)) ^ (c * np.uint64(0x165667B19E3779F9))
+    return (
+        (a * np.uint64(0x9E3779B97F4A7C15)) ^ (b * np.uint64(0xC2B2AE3D27D4EB4F)) ^ (c * np.uint64(0x165667B19E3779F9))
+    )
 
 
 def _weld_close(point: np.ndarray, weld: np.ndarray, face: np.ndarray, sides: tuple[np.ndarray, ...]) -> np.ndarray:

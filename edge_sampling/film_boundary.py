@@ -4,8 +4,10 @@ For a pixel with filter k, I = ∫ k(u) L(u) du. Where an edge moves with the ve
 
     ∮ k(u) · (L⁻ − L⁺) · (n · du/dθ) dl,        n: unit normal of the edge on the film, from the − side to the + side
 
-(Li et al. 2018, Eq. 7, with the edge function's gradient written as a velocity). With the edge as a curve u(t), the length element and the normal
-join to n dl = (−u'ᵧ, u'ₓ) dt, so that neither is ever normalised.
+(Li et al. 2018, Eq. 7, with the edge function's gradient written as a velocity). With the edge as a curve u(t), the
+length element and the normal join to n dl = (−u'ᵧ, u'ₓ) dt, so that neither is ever normalised.
+
+Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces.
 """
 
 from __future__ import annotations
@@ -15,14 +17,15 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .device_edges import DeviceEdges
 from .edges import Edges
 from .meshes import Geometry
 from .projection import FilmPoint, Projection
 
-#: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so an edge that cannot be
-#: seen changes nothing, not even the last bit.
+#: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
+#: an edge that cannot be seen changes nothing, not even the last bit.
 LENGTH_UNIT = 2.0**-16
 
 
@@ -48,12 +51,15 @@ class FilmBoundary:
     Parameters
     ----------
     geometry : the meshes.
-    edges : the edges that can move, on the host.
+    edges : the edges that can move over the film, on the host.
+    faces : (F, 3), vertex indices of the faces that can, on the host.
     """
 
-    def __init__(self, geometry: Geometry, edges: Edges):
+    def __init__(self, geometry: Geometry, edges: Edges, faces: np.ndarray):
         self.geometry = geometry
         self.edges = DeviceEdges(edges)
+        self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)]
+        self.count = len(edges) + len(faces)
 
     def sample(
         self,
@@ -64,13 +70,15 @@ class FilmBoundary:
     ) -> BoundarySamples:
         """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
 
-        Edges are chosen in proportion to their length on the film, and points uniformly along them, both by one stratified number.
+        Edges are chosen in proportion to their length on the film, and points uniformly along them, both by one
+        stratified number.
 
         sampler : seeded for `count` lanes.
-        radiance : maps rays to (L, alpha), detached. Called for both sides of the edge with equal random numbers, so that an edge that is hidden,
-            or across which nothing jumps, contributes next to nothing rather than noise.
+        radiance : maps rays to (L, alpha), detached. Called for both sides of the edge with equal random numbers, so
+            that an edge that is hidden, or across which nothing jumps, contributes next to nothing rather than noise.
 
-        Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by it.
+        Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by
+        it.
         """
         with dr.resume_grad():
             projection = Projection(sensor)
@@ -78,14 +86,14 @@ class FilmBoundary:
         with dr.suspend_grad():
             aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
             edge, along, density = self._choose(projection, positions, sensor.film(), sampler, count)
-            a, b = self.edges.end_points(positions, edge)
+            a, b = self._end_points(projection, positions, edge)
             segment = _clip(projection, projection.film(a), projection.film(b), sensor.film())
             t, dt = segment.parameter(along)
             tangent = _tangent(projection, a, b, t, aperture_sample)
 
         # Only here does the gradient enter: the velocity of a point that is fixed on the edge.
         with dr.resume_grad():
-            a, b = self.edges.end_points(positions, edge)
+            a, b = self._end_points(projection, positions, edge)
             u = projection.film(dr.lerp(a, b, t), aperture_sample).position()
             velocity = u - dr.detach(u)
 
@@ -94,7 +102,9 @@ class FilmBoundary:
             n = dr.normalize(n_dl)
             u = dr.detach(u)
             offset = self._offset(projection, dr.lerp(a, b, t)) * n
-            active = (density > 0) & (segment.length > 0) & dr.isfinite(dr.squared_norm(n_dl)) & _inside(u, sensor.film())
+            active = (
+                (density > 0) & (segment.length > 0) & dr.isfinite(dr.squared_norm(n_dl)) & _inside(u, sensor.film())
+            )
             time = sensor.shutter_open()
             if sensor.shutter_open_time() > 0:
                 time += sampler.next_1d() * sensor.shutter_open_time()
@@ -119,36 +129,70 @@ class FilmBoundary:
     def _choose(
         self, projection: Projection, positions: mi.Float, film: mi.Film, sampler: mi.Sampler, count: int
     ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-        """Choose edges in proportion to their length on the film: edge, position along its visible part in [0, 1), samples per unit of it."""
+        """Choose edges in proportion to their length on the film.
+
+        Returns
+        -------
+        edge : mi.UInt32, (count,)
+        along : mi.Float, (count,), position along its visible part, uniform in [0, 1) on the film.
+        density : mi.Float, (count,), expected number of samples on the edge; 0 where no edge is visible.
+        """
         length = self._visible_length(projection, positions, film)
         quantised = mi.UInt64(dr.ceil(mi.Float64(length) / LENGTH_UNIT))
         cumulative = dr.cumsum(quantised)
-        total = mi.Float64(dr.gather(mi.UInt64, cumulative, self.edges.count - 1))
+        total = mi.Float64(dr.gather(mi.UInt64, cumulative, self.count - 1))
         x = (mi.Float64(dr.arange(mi.UInt32, count)) + mi.Float64(sampler.next_1d())) * (total / count)
         whole = mi.UInt64(x)
-        edge = dr.binary_search(0, self.edges.count - 1, lambda i: dr.gather(mi.UInt64, cumulative, i) <= whole)
+        edge = dr.binary_search(0, self.count - 1, lambda i: dr.gather(mi.UInt64, cumulative, i) <= whole)
         size = mi.Float64(dr.gather(mi.UInt64, quantised, edge))
         start = mi.Float64(dr.gather(mi.UInt64, cumulative, edge)) - size
         along = dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float))
         return edge, along, dr.select(total > 0, mi.Float(count * size / total), 0)
 
     def _visible_length(self, projection: Projection, positions: mi.Float, film: mi.Film) -> mi.Float:
-        """Length on the film, in pixels, of the part of each edge inside the frame; 0 where nothing can jump across the edge: (E,)."""
-        everything = dr.arange(mi.UInt32, self.edges.count)
-        a, b = self.edges.end_points(positions, everything)
-        length = _clip(projection, projection.film(a), projection.film(b), film).length
+        """Length inside the frame of each edge and cut, 0 where nothing can jump: (E + F,), pixels on the film."""
+        edge, face = dr.arange(mi.UInt32, self.edges.count), dr.arange(mi.UInt32, self.count - self.edges.count)
         jumps = self.edges.is_boundary(
             positions,
-            everything,
+            edge,
             projection.eye(),
             view=projection.view() if projection.orthographic else None,
             radius=projection.lens_radius(),
             geometry=self.geometry,
         )
-        return dr.select(jumps, length, 0)
+        lengths = []
+        for a, b in (self.edges.end_points(positions, edge), self._cut(projection, positions, face)):
+            lengths.append(_clip(projection, projection.film(a), projection.film(b), film).length)
+        return dr.concat([dr.select(jumps, lengths[0], 0), lengths[1]])
+
+    def _end_points(
+        self, projection: Projection, positions: mi.Float, index: mi.UInt32
+    ) -> tuple[mi.Point3f, mi.Point3f]:
+        """End points of edges, or beyond their number of cuts: world space."""
+        is_edge = index < self.edges.count
+        edge = self.edges.end_points(positions, dr.select(is_edge, index, 0))
+        cut = self._cut(projection, positions, dr.select(is_edge, 0, index - self.edges.count))
+        return tuple(dr.select(is_edge, e, c) for e, c in zip(edge, cut, strict=True))
+
+    def _cut(self, projection: Projection, positions: mi.Float, face: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
+        """End points of the cut of the near clipping plane through faces; NaN where there is none. World space."""
+        corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, corner, face)) for corner in self.corners]
+        depth = [(projection.to_local @ p).z - projection.near for p in corners]
+        # The corner that has the plane between itself and the two others, first.
+        front = [d > 0 for d in depth]
+        for k in (1, 2):
+            alone = (front[k] != front[0]) & (front[k] != front[3 - k])
+            corners[0], corners[k] = dr.select(alone, corners[k], corners[0]), dr.select(alone, corners[0], corners[k])
+            depth[0], depth[k] = dr.select(alone, depth[k], depth[0]), dr.select(alone, depth[0], depth[k])
+        crossed = (front[0] != front[1]) | (front[0] != front[2])
+        points = []
+        for k in (1, 2):
+            t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)
+            points.append(dr.select(crossed, dr.lerp(corners[0], corners[k], t), dr.nan))
+        return points[0], points[1]
 
     def _offset(self, projection: Projection, p: mi.Point3f) -> mi.Float:
-        """How far from the edge its two sides are looked at, in pixels: just beyond what single precision can tell apart."""
+        """How far beside the edge to look, in pixels: just beyond what single precision can tell apart."""
         ulp = dr.epsilon(mi.Float) * 2
         in_world = 8 * ulp * dr.max(dr.abs(mi.Vector3f(p))) * projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
@@ -157,7 +201,7 @@ class FilmBoundary:
 
 @dataclass(frozen=True)
 class _Segment:
-    """The visible part of an edge: the interval of its parameter, the depths at its ends, and its length on the film in pixels."""
+    """The visible part of an edge: the interval of its parameter, depths at its ends, and length on the film, pixels."""
 
     start: mi.Float
     end: mi.Float
@@ -173,11 +217,12 @@ class _Segment:
 
 
 def _clip(projection: Projection, a: FilmPoint, b: FilmPoint, film: mi.Film) -> _Segment:
-    """Clip edges to the near and far planes and to the frame, widened by the blur of the lens (Liang and Barsky 1984)."""
+    """Clip edges to near and far planes and to the frame plus the blur of the lens (Liang and Barsky 1984)."""
     lower, upper = _frame(film)
     blur_a, blur_b = projection.blur(a), projection.blur(b)
     start, end = mi.Float(0), mi.Float(1)
-    planes = [(a.z - projection.near, b.z - projection.near), (projection.far - a.z, projection.far - b.z)]
+    near, far = projection.near * (1 - 1e-4), projection.far  # cuts lie on the near plane, but for rounding
+    planes = [(a.z - near, b.z - near), (far - a.z, far - b.z)]
     for i in (0, 1):
         planes.append((a.xy[i] - lower[i] * a.w + blur_a, b.xy[i] - lower[i] * b.w + blur_b))
         planes.append((upper[i] * a.w - a.xy[i] + blur_a, upper[i] * b.w - b.xy[i] + blur_b))
@@ -193,7 +238,7 @@ def _clip(projection: Projection, a: FilmPoint, b: FilmPoint, film: mi.Film) -> 
 
 
 def _frame(film: mi.Film) -> tuple[mi.ScalarPoint2f, mi.ScalarPoint2f]:
-    """The part of the film on which samples are taken, in pixels: the crop window, and the border if the film samples it."""
+    """The part of the film that is sampled, in pixels: the crop window, and the border if the film asks for it."""
     border = film.rfilter().border_size() if film.sample_border() else 0
     lower = mi.ScalarPoint2f(film.crop_offset()) - border
     return lower, lower + mi.ScalarVector2f(film.crop_size()) + 2 * border
@@ -204,7 +249,9 @@ def _inside(u: mi.Point2f, film: mi.Film) -> mi.Bool:
     return dr.all((u >= lower) & (u < upper))
 
 
-def _tangent(projection: Projection, a: mi.Point3f, b: mi.Point3f, t: mi.Float, aperture_sample: mi.Point2f | None) -> mi.Vector2f:
+def _tangent(
+    projection: Projection, a: mi.Point3f, b: mi.Point3f, t: mi.Float, aperture_sample: mi.Point2f | None
+) -> mi.Vector2f:
     """du/dt along the edges, in pixels: derivative of a quotient of two linear functions."""
     p, q = projection.film(a, aperture_sample), projection.film(b, aperture_sample)
     w = dr.lerp(p.w, q.w, t)

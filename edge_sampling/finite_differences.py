@@ -21,8 +21,9 @@ class FiniteDifferences:
 
     mean : (H, W, C), float32, linear radiance per unit of θ; central differences with half the step.
     standard_error : (H, W, C), float32; of the mean, from the spread of the runs.
-    step_error : (H, W, C), float32; by how much the whole step gives another result. It bounds the error of the half step where an edge enters or
-        leaves a pixel within it (the error grows at least linearly with the step), and exceeds it where the image is smooth.
+    step_error : (H, W, C), float32; by how much the whole step gives another result. It bounds the error of the half
+        step where an edge enters or leaves a pixel within it (the error grows at least linearly with the step), and
+        exceeds it where the image is smooth.
     settings : how it was made.
     """
 
@@ -33,7 +34,11 @@ class FiniteDifferences:
 
     def write(self, path: str | Path, metadata: dict[str, Any] | None = None) -> None:
         """Write an EXR file: mean in R, G, B, the errors in layers of their names, settings in the header."""
-        write_exr(path, {"": self.mean, "standard_error": self.standard_error, "step_error": self.step_error}, {**self.settings, **(metadata or {})})
+        write_exr(
+            path,
+            {"": self.mean, "standard_error": self.standard_error, "step_error": self.step_error},
+            {**self.settings, **(metadata or {})},
+        )
 
     @staticmethod
     def read(path: str | Path) -> FiniteDifferences:
@@ -56,8 +61,9 @@ def finite_differences(
 ) -> FiniteDifferences:
     """Central differences (I(+h) − I(−h)) / 2h over independent runs, for a step and for half of it.
 
-    The four images of a run share their random numbers, drawn from a stratified sampler (`multijitter`): at hard edges this is 3 to 7 times less
-    noise than independent samples. Choose h so that the image moves by a few hundredths of a pixel: a tenth already smears hard edges visibly.
+    The four images of a run share their random numbers, drawn from a stratified sampler (`multijitter`): at hard edges
+    this is 3 to 7 times less noise than independent samples. Choose h so that the image moves by a few hundredths of a
+    pixel: a tenth already smears hard edges visibly.
 
     Parameters
     ----------
@@ -103,7 +109,9 @@ def finite_differences(
     return FiniteDifferences(*(a.astype(np.float32) for a in layers), settings)
 
 
-def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
+def render_stratified(
+    scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int
+) -> mi.TensorXf:
     """Render with the `multijitter` sampler, whichever the sensor has: (H, W, C), linear radiance.
 
     integrator : a sampling integrator of Mitsuba (`path`, `direct`, ...).

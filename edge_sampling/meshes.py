@@ -15,7 +15,8 @@ class Geometry:
     """The shapes of a scene, sorted by what can be done with them.
 
     meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known.
-    others : shapes without edges here (spheres, curves, instances, ...). They occlude and receive light, but must not move.
+    others : shapes without edges here (spheres, curves, instances, ...). They occlude and receive light, but must not
+        move.
     """
 
     meshes: tuple[Any, ...]
@@ -32,6 +33,12 @@ class Geometry:
         """What must stay the same for the edges found earlier to be valid: which meshes there are, and their sizes."""
         return tuple((int(m.ptr), m.vertex_count(), m.face_count()) for m in self.meshes)
 
+    def faces(self, wanted: tuple[bool, ...]) -> np.ndarray:
+        """Faces of the meshes that are `wanted`: (F, 3), indices into `positions`, on the host."""
+        offsets = np.cumsum([0, *(m.vertex_count() for m in self.meshes)])
+        chosen = [faces(m) + np.uint32(o) for m, o, w in zip(self.meshes, offsets, wanted, strict=False) if w]
+        return np.concatenate(chosen) if chosen else np.zeros((0, 3), np.uint32)
+
     def moving(self) -> tuple[bool, ...]:
         """For every mesh: do its vertices carry a gradient?"""
         return tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
@@ -46,16 +53,17 @@ class Geometry:
         for shape in self.others:
             params = mi.traverse(shape)
             # Keys with a dot belong to the BSDF, the emitter or a texture of the shape.
-            own = [k for k in params.keys() if "." not in k]
+            own = [k for k in list(params.keys()) if "." not in k]
             moved = [k for k in own if dr.grad_enabled(params[k])]
             if moved:
                 raise RuntimeError(
-                    f'{who}: shape "{shape.id()}" ({shape.class_name()}) moves ("{moved[0]}" carries a gradient), but its '
-                    "silhouettes cannot be sampled yet: only triangle meshes can move. Replace it by a mesh, or detach it."
+                    f'{who}: shape "{shape.id()}" ({shape.class_name()}) moves ("{moved[0]}" carries a gradient), '
+                    "but its silhouettes cannot be sampled yet: only triangle meshes can move. "
+                    "Replace it by a mesh, or detach it."
                 )
 
     def positions(self) -> mi.Float:
-        """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units, with their gradients."""
+        """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
         return _concat([m.vertex_positions_buffer() for m in self.meshes])
 
     def normals(self) -> mi.Float:
@@ -91,7 +99,7 @@ def has_interpolated_normals(mesh: Any) -> bool:
 
 def has_face_attributes(mesh: Any) -> bool:
     """Does the mesh carry attributes that are constant on a face, and so jump at each of its edges?"""
-    return any(k.startswith("face_") for k in mi.traverse(mesh).keys())
+    return any(k.startswith("face_") for k in list(mi.traverse(mesh).keys()))
 
 
 def _concat(buffers: list[mi.Float]) -> mi.Float:
@@ -101,7 +109,7 @@ def _concat(buffers: list[mi.Float]) -> mi.Float:
 
 
 def jumping_textures(scene: mi.Scene) -> list[str]:
-    """Names of the textures in the scene whose value jumps inside of a face, such as checkerboards and bitmaps with the `nearest` filter."""
+    """Names of the textures whose value jumps inside of a face: checkerboards, bitmaps with the `nearest` filter."""
     return [f'"{t.id()}" ({t.class_name()})' for t in _objects(scene) if isinstance(t, mi.Texture) and _jumps(t)]
 
 
@@ -123,7 +131,7 @@ def _objects(root: mi.Object) -> list[Any]:
 
 
 def _jumps(texture: Any, pairs: int = 256, steps: int = 18) -> bool:
-    """Bisect random segments towards their steepest half: where the texture is continuous, the difference of the end points dies out."""
+    """Bisect random segments towards their steeper half: where a texture is continuous, the difference dies out."""
     if not texture.is_spatially_varying() or not texture.class_name().startswith(("Bitmap", "Checkerboard")):
         return False
     with dr.suspend_grad():

@@ -11,16 +11,18 @@ import numpy as np
 
 
 class Motion:
-    """Moves one parameter of a scene along a line, or turns it about an axis: p(θ), with p(0) its value at construction.
+    """Moves one parameter of a scene along a line, or turns it about an axis: p(θ), where p(0) is its present value.
 
     Parameters
     ----------
     scene : mi.Scene
     key : name of the parameter, as `mi.traverse(scene)` has it.
-    direction : displacement per unit of θ. For vertex positions and `to_world`, 3 numbers, world space; for any other parameter as many
-        numbers as it has, or 1 for all.
-    rotate : axis, 3 numbers, world space (need not be normalised); θ in radians. Only for vertex positions and `to_world`.
-    pivot : 3 numbers, world space, a point on the axis. Default: the mean of the vertices, or the origin of the `to_world` frame.
+    direction : displacement per unit of θ. For vertex positions and `to_world`, 3 numbers, world space; for any other
+        parameter as many numbers as it has, or 1 for all.
+    rotate : axis, 3 numbers, world space (need not be normalised); θ in radians. Only for vertex positions and
+        `to_world`.
+    pivot : 3 numbers, world space, a point on the axis. Default: the mean of the vertices, or the origin of the
+        `to_world` frame.
     vertices : indices of the vertices that move. Default: all.
 
     Raises
@@ -58,7 +60,9 @@ class Motion:
         self.initial = type(value)(dr.detach(value))
         geometric = self.is_positions or self.is_transform
         size = 3 if geometric else dr.size_v(value) * dr.width(value)
-        self.direction = None if direction is None else _numbers(key, "direction", direction, {size} if geometric else {1, size})
+        self.direction = (
+            None if direction is None else _numbers(key, "direction", direction, {size} if geometric else {1, size})
+        )
         self.rotate = None if rotate is None else _numbers(key, "axis", rotate, {3})
         if self.rotate is not None and not np.any(self.rotate):
             raise ValueError(f'"{key}": the axis of rotation is zero')
@@ -85,7 +89,11 @@ class Motion:
 
     def __str__(self) -> str:
         numbers = lambda a: "(" + ", ".join(f"{x:g}" for x in a) + ")"
-        return f"{self.key} along {numbers(self.direction)}" if self.rotate is None else f"{self.key} about {numbers(self.rotate)}"
+        return (
+            f"{self.key} along {numbers(self.direction)}"
+            if self.rotate is None
+            else f"{self.key} about {numbers(self.rotate)}"
+        )
 
     def apply(self, theta: mi.Float | float) -> None:
         """Set the parameter to p(θ) and update the scene; attached if `theta` is."""
@@ -99,7 +107,11 @@ class Motion:
             value = self._transform(theta) @ self.initial
         else:
             direction = mi.Float(self.direction)
-            value = dr.ravel(self.initial) + theta * direction if dr.size_v(self.initial) > 1 else self.initial + theta * direction
+            value = (
+                dr.ravel(self.initial) + theta * direction
+                if dr.size_v(self.initial) > 1
+                else self.initial + theta * direction
+            )
             value = dr.unravel(type(self.initial), value) if dr.size_v(self.initial) > 1 else type(self.initial)(value)
         self.params[self.key] = value
         self.params.update()
@@ -115,7 +127,8 @@ class Motion:
 def derivative_image(
     scene: mi.Scene, integrator: mi.Integrator, motion: Motion, *, sensor: int | mi.Sensor = 0, spp: int, seed: int = 0
 ) -> mi.TensorXf:
-    """Derivative of the rendered image with respect to θ at θ = 0, in forward mode: (H, W, C), linear, per `motion.unit`.
+    """Derivative of the rendered image with respect to θ at θ = 0, in forward mode: (H, W, C), linear, per
+    `motion.unit`.
 
     The scene is left as it was at the construction of `motion`. Works with every differentiable integrator of Mitsuba.
     """

@@ -31,7 +31,8 @@ class FilmPoint:
 class Projection:
     """The projection of a sensor as it stands, attached to every parameter of the sensor that carries a gradient.
 
-    It inverts `Sensor.sample_ray`: `film(ray(t), aperture_sample).position()` is the film position that the ray was made for.
+    It inverts `Sensor.sample_ray`: `film(ray(t), aperture_sample).position()` is the film position that the ray was
+    made for.
 
     Parameters
     ----------
@@ -45,7 +46,9 @@ class Projection:
     def __init__(self, sensor: mi.Sensor):
         kind = sensor.class_name()
         if kind not in SENSORS.values():
-            raise RuntimeError(f'film boundary: sensor "{sensor.id()}" ({kind}) is not supported, use one of {", ".join(SENSORS)}')
+            raise RuntimeError(
+                f'film boundary: sensor "{sensor.id()}" ({kind}) is not supported, use one of {", ".join(SENSORS)}'
+            )
         params = mi.traverse(sensor)
         film = sensor.film()
         self.crop_offset = mi.ScalarVector2f(film.crop_offset())
@@ -54,12 +57,13 @@ class Projection:
         self.to_world = sensor.world_transform()
         self.to_local = self.to_world.inverse()
         self.to_sample = sensor.projection_transform().matrix
-        # The offsets are relative to the whole film, the sample space to the crop window (as in Mitsuba's `perspective`).
+        # The offsets are relative to the whole film, the sample space to the crop window (as in Mitsuba's
+        # `perspective`).
         self.principal_point = mi.Vector2f(0)
         if "principal_point_offset_x" in params:
             offset = mi.Vector2f(params["principal_point_offset_x"], params["principal_point_offset_y"])
             self.principal_point = offset * mi.ScalarVector2f(film.size()) / self.crop_size
-        self.aperture_radius = params["aperture_radius"] if "aperture_radius" in params else None
+        self.aperture_radius = params["aperture_radius"] if kind == SENSORS["thinlens"] else None
         self.focus_distance = sensor.focus_distance()
         self.near, self.far = sensor.near_clip(), sensor.far_clip()
         self.attached = dr.grad_enabled(
@@ -67,14 +71,16 @@ class Projection:
         )  # fmt: skip
 
     def film(self, p: mi.Point3f, aperture_sample: mi.Point2f | None = None) -> FilmPoint:
-        """Project a point through the centre of the lens, or through the point of the lens that `aperture_sample` stands for.
+        """Project a point through the centre of the lens, or through the point of the lens that `aperture_sample`
+        stands for.
 
         p : mi.Point3f, (N,), world space, scene units.
         """
         q = self.to_local @ p
         xyz, w = mi.Vector3f(q), mi.Float(1)
         if aperture_sample is not None and self.aperture_radius is not None:
-            # The line from the lens through q meets the plane in focus at lens + (q - lens) f / q.z. Times q.z, this is linear in q.
+            # The line from the lens through q meets the plane in focus at lens + (q - lens) f / q.z. Times q.z, this
+            # is linear in q.
             lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample) * self.aperture_radius
             f = self.focus_distance
             xyz, w = mi.Vector3f(lens.x * (q.z - f) + f * q.x, lens.y * (q.z - f) + f * q.y, f * q.z), q.z
@@ -95,7 +101,8 @@ class Projection:
         return mi.Float(0) if self.aperture_radius is None else dr.detach(mi.Float(self.aperture_radius))
 
     def blur(self, point: FilmPoint) -> mi.Float:
-        """Largest displacement on the film, times `point.w`, that another point of the lens than its centre makes, in pixels. Detached."""
+        """Largest displacement on the film, times `point.w`, that another point of the lens than its centre makes, in
+        pixels. Detached."""
         if self.aperture_radius is None:
             return mi.Float(0)
         scale = dr.abs(dr.detach(self.to_sample)[0, 0]) * self.crop_size.x

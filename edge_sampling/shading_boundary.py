@@ -1,11 +1,14 @@
-"""Boundaries at shading points: what edges add to the derivative of reflected light as they move past a light, seen from the point.
+"""Boundaries at shading points: what edges add to the derivative of reflected light as they move past a light, seen
+from the point.
 
-At a point x, L = ∫ f |cos θ| Lᵢ(ω) dω over the sphere jumps at the great-circle arcs that the edges subtend. Its derivative gains
+At a point x, the integrand of L = ∫ f |cos θ| Lᵢ(ω) dω jumps at the great-circle arcs that the edges subtend. The
+derivative of L gains
 
     ∮ f |cos θ| · Σ_sides ± L_side · n · (ω̇_edge − ω̇_side) dl,        n dl = (ω × dω/dt) dt = (ω × e′(t)) / r dt
 
-with ω = (e(t) − x) / r. A side's own velocity ω̇_side is that of its *material point*, since this is what the interior derivative holds fixed; it is 0 for
-a side at infinity. So an emitter contributes nothing by its own outline, but all that it loses behind another edge.
+with ω = (e(t) − x) / r. A side's own velocity ω̇_side is that of its *material point*, since this is what the interior
+derivative holds fixed; it is 0 for a side at infinity. So an emitter contributes nothing by its own outline, but all
+that it loses behind another edge.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ from .meshes import Geometry
 
 
 class ShadingBoundary:
-    """Samples the edges of a scene as shading points see them. Edges are chosen in proportion to their length in space, wherever they are.
+    """Samples the edges of a scene as shading points see them. Edges are chosen in proportion to their length in
+    space, wherever they are.
 
     Unbiased, but noisy where a mesh has many edges of which few matter at a point.
 
@@ -40,7 +44,9 @@ class ShadingBoundary:
         self.moving_count = int(moves.sum())
         self.lights_move = any(m.is_emitter() for m in self.moving_meshes)
 
-    def sample(self, scene: mi.Scene, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, camera_moves: bool) -> mi.Spectrum:
+    def sample(
+        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, camera_moves: bool
+    ) -> mi.Spectrum:
         """One sample of the boundary integral at each of `si`, for emitted light only.
 
         si : attached to whatever moves it.

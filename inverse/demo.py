@@ -150,7 +150,7 @@ def show_derivatives(study: Study, out: Path) -> Section:
 def _derivative(scene: Any, method: str, motion: Motion) -> tuple[np.ndarray, float]:
     """Mean of `RENDERS` derivatives, (H, W, C), and the median time of one in seconds."""
     integrator = mi.load_dict({"type": method})
-    render = lambda seed: np.array(derivative_image(scene, integrator, motion, spp=SPP, seed=seed))  # noqa: E731
+    render = lambda seed: np.array(derivative_image(scene, integrator, motion, spp=SPP, seed=seed))
     images, seconds = zip(*(_timed(lambda seed=seed: render(seed)) for seed in range(RENDERS)), strict=True)
     return np.mean(images, axis=0), float(np.median(seconds[1:]))
 
@@ -206,7 +206,7 @@ def vertex_errors(fit: VertexFit, truth: dict[str, np.ndarray], resolution: int)
     truth : key -> (V, 3), world space. resolution : width of the picture, pixels.
     """
     focal_length = resolution / (2 * np.tan(np.radians(45 / 2)))  # pixels; the camera stands at z = -5
-    film = lambda p: focal_length * p[..., :2] / (p[..., 2:] + 5)  # noqa: E731
+    film = lambda p: focal_length * p[..., :2] / (p[..., 2:] + 5)
     distances = [np.linalg.norm(film(fit.history[key]) - film(truth[key]), axis=-1) for key in truth]
     return np.concatenate(distances, axis=1).max(1)
 

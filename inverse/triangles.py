@@ -82,7 +82,7 @@ def fit_vertices(
     params = mi.traverse(scene)
     _check_keys(params, keys)
     integrator = integrator or mi.load_dict({"type": "direct_edge"})
-    render = lambda seed, spp: mi.render(scene, params, sensor=sensor, integrator=integrator, seed=seed, spp=spp)  # noqa: E731
+    render = lambda seed, spp: mi.render(scene, params, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
     target = mi.TensorXf(_check_target(target, scene.sensors()[sensor].film()))
 
     optimiser = mi.ad.Adam(lr=learning_rate)

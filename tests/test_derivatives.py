@@ -1,12 +1,14 @@
-"""Derivative images against finite differences: every case of `cases.py`, in terms of the reference's and their own standard errors."""
+"""Derivative images against finite differences: every case of `cases.py`, in terms of the reference's and their own
+standard errors."""
 
 import cases
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image
 from zscores import mean_and_error, z_scores
+
+from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +23,9 @@ def measure(case: cases.Case) -> tuple[np.ndarray, np.ndarray]:
     motion = Motion(scene, **case.motion)
     integrator = mi.load_dict({"type": "direct_edge", **case.integrator})
     return mean_and_error(
-        np.array([derivative_image(scene, integrator, motion, spp=case.spp, seed=i) for i in range(case.seeds)], np.float64)
+        np.array(
+            [derivative_image(scene, integrator, motion, spp=case.spp, seed=i) for i in range(case.seeds)], np.float64
+        )
     )
 
 

@@ -5,10 +5,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from zscores import mean_and_error, z_scores
+
 import rimlight.scenes
 from rimlight.edge_sampling import Motion, derivative_image
 from rimlight.edge_sampling.exr import read_exr
-from zscores import mean_and_error, z_scores
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +74,9 @@ def test_boundary_samples_do_not_touch_the_image():
 # ---------------------- Consistency ----------------------
 
 
-@pytest.mark.parametrize("name", ["two_triangles_green", "cube_depth", "room_light", "thin_lens_camera", "gaussian_filter", "crop_window"])
+@pytest.mark.parametrize(
+    "name", ["two_triangles_green", "cube_depth", "room_light", "thin_lens_camera", "gaussian_filter", "crop_window"]
+)
 def test_forward_and_backward_agree(name):
     case = cases.case(name)
     scene = case.scene()
@@ -123,7 +126,14 @@ def one_thread():
 def test_object_behind_the_camera_changes_nothing_at_all(key, rfilter, one_thread):
     """The faces of the cube emit and reflect nothing, so that nothing behind the camera matters to them."""
     images = []
-    for extra in ({}, {"a_behind": cases.mesh("a_behind", [[0, 3, -9], [1, 3, -9], [0, 4, -9.5]], [[0, 1, 2]], bsdf=cases.diffuse(0.5))}):
+    for extra in (
+        {},
+        {
+            "a_behind": cases.mesh(
+                "a_behind", [[0, 3, -9], [1, 3, -9], [0, 4, -9.5]], [[0, 1, 2]], bsdf=cases.diffuse(0.5)
+            )
+        },
+    ):
         scene = cases.coloured_cube(lambda: cases.camera(film=cases.film(rfilter)), **extra)
         images.append(jacobian_times(scene, Motion(scene, key, direction=[1, 0, 0]), sppi=0))
     assert np.abs(images[0]).sum() > 0
@@ -201,7 +211,9 @@ def moving(scene, key, **motion):
 
 @pytest.mark.parametrize("shape", ["sphere", "disk", "cylinder"])
 def test_shapes_without_edges_must_stand_still(shape):
-    scene = cases.cube(thing=lambda: {"type": shape, "id": "thing", "to_world": mi.ScalarTransform4f().translate([0, 2, 0])})()
+    scene = cases.cube(
+        thing=lambda: {"type": shape, "id": "thing", "to_world": mi.ScalarTransform4f().translate([0, 2, 0])}
+    )()
     with pytest.raises(RuntimeError, match=rf'shape "thing" \({shape.capitalize()}\) moves'):
         moving(scene, "thing.to_world", direction=[1, 0, 0])
     with pytest.raises(RuntimeError, match='camera moves past "thing"'):
@@ -211,7 +223,12 @@ def test_shapes_without_edges_must_stand_still(shape):
 
 def test_instances_must_stand_still():
     group = {"type": "shapegroup", "inner": cases.smooth_cube()}
-    scene = cases.scene(sensor=cases.camera(), group=group, copy={"type": "instance", "id": "copy", "r": {"type": "ref", "id": "group"}}, environment=cases.constant())
+    scene = cases.scene(
+        sensor=cases.camera(),
+        group=group,
+        copy={"type": "instance", "id": "copy", "r": {"type": "ref", "id": "group"}},
+        environment=cases.constant(),
+    )
     with pytest.raises(RuntimeError, match=r'shape "copy" \(Instance\) moves'):
         moving(scene, "copy.to_world", direction=[1, 0, 0])
 
@@ -254,8 +271,16 @@ def warnings_of(scene, key, options, **motion) -> str:
 
 def test_limits_are_warned_about_once():
     lamp = lambda: {"type": "point", "position": [0, 4, 0], "intensity": {"type": "rgb", "value": 5.0}}
-    mirror = lambda: {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, -2, 0]), "bsdf": {"type": "conductor"}}
-    board = lambda: {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, -3, 0]), "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
+    mirror = lambda: {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, -2, 0]),
+        "bsdf": {"type": "conductor"},
+    }
+    board = lambda: {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, -3, 0]),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
+    }
     scene = cases.cube(lamp=lamp, mirror=mirror, board=board)()
     text = warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
     for part in ("hard shadows of point", "perfect mirrors", "jumps of the textures"):

@@ -6,6 +6,7 @@ import cases
 import mitsuba as mi
 import numpy as np
 import pytest
+
 from rimlight.edge_sampling import EdgeKind, Geometry, find_edges
 
 

@@ -5,6 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+
 from rimlight.edge_sampling import Projection
 
 CROP = {"width": 64, "height": 48, "crop_width": 20, "crop_height": 16, "crop_offset_x": 7, "crop_offset_y": 11}
@@ -47,6 +48,8 @@ def test_follows_every_parameter_of_the_camera():
 
 
 def test_unknown_sensor_is_refused():
-    sensor = mi.load_dict({"type": "distant", "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}})
+    sensor = mi.load_dict(
+        {"type": "distant", "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
+    )
     with pytest.raises(RuntimeError, match="use one of perspective, thinlens, orthographic"):
         Projection(sensor)

@@ -3,11 +3,17 @@
 import numpy as np
 
 
-def z_scores(mean: np.ndarray, error: np.ndarray, reference: np.ndarray, reference_error: np.ndarray, bias: np.ndarray | float = 0.0) -> np.ndarray:
+def z_scores(
+    mean: np.ndarray,
+    error: np.ndarray,
+    reference: np.ndarray,
+    reference_error: np.ndarray,
+    bias: np.ndarray | float = 0.0,
+) -> np.ndarray:
     """(mean − reference) / standard error of the difference: (H, W, C).
 
-    Where few runs saw anything, their spread says little: a pixel takes the mean variance of its 3 × 3 neighbours if that is larger, and
-    nothing is trusted below a thousandth of the image's scale.
+    Where few runs saw anything, their spread says little: a pixel takes the mean variance of its 3 × 3 neighbours if
+    that is larger, and nothing is trusted below a thousandth of the image's scale.
 
     bias : a known bound on the error of the reference that is not noise.
     """

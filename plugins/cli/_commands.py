@@ -370,7 +370,7 @@ class Check(_OnMotion):
             for k in bar:
                 launches = _seeds(self.spp, self.pixels(scene), self.seed)
                 launches = [(seed + k * len(launches), spp) for seed, spp in launches]
-                render = lambda seed, spp: derivative_image(  # noqa: E731
+                render = lambda seed, spp: derivative_image(
                     scene, integrator, motion, sensor=self.sensor, spp=spp, seed=seed
                 )
                 renders.append(_accumulate(render, launches, "launch"))

@@ -54,7 +54,7 @@ def compare(derivative: np.ndarray, error: np.ndarray, reference: FiniteDifferen
     too small. And a finite step smears an edge over its path: some per cent of a value end up in the pixels around.
     """
     f = reference.mean
-    around = lambda a: maximum_filter(a, size=(3, 3, 1))  # noqa: E731
+    around = lambda a: maximum_filter(a, size=(3, 3, 1))
     alive = (derivative != 0) | (f != 0)
     if not alive.any():
         return Comparison(0, 0, 0, 0, 0, 0, 0)

@@ -1,4 +1,5 @@
-"""What the integrators with edge sampling share: sample counts, the edges of a scene, and the way to a derivative image."""
+"""What the integrators with edge sampling share: sample counts, the edges of a scene, and the way to a derivative
+image."""
 
 from __future__ import annotations
 
@@ -9,7 +10,15 @@ import mitsuba as mi
 import numpy as np
 from mitsuba.ad.integrators.common import ADIntegrator
 
-from rimlight.edge_sampling import Edges, FilmBoundary, Geometry, Projection, ShadingBoundary, find_edges, jumping_textures
+from rimlight.edge_sampling import (
+    Edges,
+    FilmBoundary,
+    Geometry,
+    Projection,
+    ShadingBoundary,
+    find_edges,
+    jumping_textures,
+)
 
 
 @dataclass
@@ -38,7 +47,8 @@ class Term:
 
 @dataclass(frozen=True)
 class Boundaries:
-    """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera does."""
+    """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
+    does."""
 
     film: FilmBoundary
     shading: ShadingBoundary
@@ -46,10 +56,11 @@ class Boundaries:
 
 
 class EdgeIntegrator(ADIntegrator):
-    """Base of the integrators whose derivative has an interior term, from `sample`, and a boundary term, from the edges of the scene.
+    """Base of the integrators whose derivative has an interior term, from `sample`, and a boundary term, from the
+    edges of the scene.
 
-    A subclass provides ``sample(mode, scene, sampler, ray, active)`` and ``sample_shading_boundary(scene, sampler, ray, boundaries)``, see
-    `DirectEdgeIntegrator`.
+    A subclass provides ``sample(mode, scene, sampler, ray, active)`` and ``sample_shading_boundary(scene, sampler,
+    ray, boundaries)``, see `DirectEdgeIntegrator`.
     """
 
     def __init__(self, props: mi.Properties):
@@ -64,7 +75,8 @@ class EdgeIntegrator(ADIntegrator):
         self._warned: set[str] = set()
 
     def to_string(self) -> str:
-        return f"{type(self).__name__}[sppc={self.sppc}, sppp={self.sppp}, sppi={self.sppi}, hide_emitters={self.hide_emitters}]"
+        counts = f"sppc={self.sppc}, sppp={self.sppp}, sppi={self.sppi}"
+        return f"{type(self).__name__}[{counts}, hide_emitters={self.hide_emitters}]"
 
     # ---------------------- Mitsuba's interface ----------------------
 
@@ -75,7 +87,8 @@ class EdgeIntegrator(ADIntegrator):
         -------
         mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
         """
-        # A parameter that carries a gradient may well not show in the image: then the derivative is zero. None at all is a mistake.
+        # A parameter that carries a gradient may well not show in the image: then the derivative is zero. None at all
+        # is a mistake.
         free = dr.ADFlag.AllowNoGrad if params is not None and dr.grad_enabled(dict(params)) else dr.ADFlag(0)
         with dr.suspend_grad():
             film, terms = self._terms(scene, sensor, seed, spp, dr.ADMode.Forward)
@@ -84,11 +97,13 @@ class EdgeIntegrator(ADIntegrator):
             return self._develop(film, terms, values)
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the image, makes of them."""
+        """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the
+        image, makes of them."""
         with dr.suspend_grad():
             film, terms = self._terms(scene, sensor, seed, spp, dr.ADMode.Backward)
             with dr.resume_grad():
-                # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray is traced for it.
+                # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
+                # is traced for it.
                 values = [dr.zeros(type(t.value), dr.width(t.position)) for t in terms]
                 dr.enable_grad(values)
                 image = self._develop(film, terms, values)
@@ -117,20 +132,21 @@ class EdgeIntegrator(ADIntegrator):
         # Without interior samples, zeros still tell how much the filter weighs at each pixel.
         sampler, weights = self._sampler(sensor, seed, sppc or 16)
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
-        L, valid = mi.Spectrum(0), mi.Bool(False)
-        if sppc > 0:
-            L, valid, _, _ = self.sample(mode, scene, sampler, ray)
+        L = self.sample(mode, scene, sampler, ray)[0] if sppc > 0 else mi.Spectrum(0)
         with dr.resume_grad():
             terms.append(Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights))
 
-        # At a pixel, the weights of the interior samples add up to `weights` times the integral of the filter. The film divides by that sum: so
+        # At a pixel, the weights of the interior samples add up to `weights` times the integral of the filter. The
+        # film divides by that sum: so
         # samples of boundaries, of weight zero, are normalised as the image is, for every filter.
 
         # ---------------------- Film boundary ----------------------
 
         if boundaries is not None and sppp > 0:
             sampler, _ = self._sampler(sensor, 0xFFFFFFFF ^ seed, sppp)
-            s = boundaries.film.sample(sensor, sampler, sampler.wavefront_size(), lambda *args: self._side(scene, *args))
+            s = boundaries.film.sample(
+                sensor, sampler, sampler.wavefront_size(), lambda *args: self._side(scene, *args)
+            )
             with dr.resume_grad():
                 terms.append(Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0))
 
@@ -180,29 +196,39 @@ class EdgeIntegrator(ADIntegrator):
         if camera_moves and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
             raise RuntimeError(
-                f"{self.name}: the camera moves past {names}, whose silhouettes cannot be sampled yet. Replace them by meshes."
+                f"{self.name}: the camera moves past {names}, whose silhouettes cannot be sampled yet. "
+                "Replace them by meshes."
             )
         if not camera_moves and not any(moving):
             return None
         self._warn_of_limits(scene, sppi)
         key = (moving, camera_moves)
         if key not in self._boundaries:
-            on_film = self._edges if camera_moves else self._edges.of_meshes(np.array(moving))
+            on_film = tuple(m or camera_moves for m in moving)
+            edges = self._edges.of_meshes(np.array(on_film))
             self._boundaries[key] = Boundaries(
-                FilmBoundary(geometry, on_film), ShadingBoundary(geometry, self._edges, moving), camera_moves
+                FilmBoundary(geometry, edges, geometry.faces(on_film)),
+                ShadingBoundary(geometry, self._edges, moving),
+                camera_moves,
             )
         return self._boundaries[key]
 
     def _warn_of_limits(self, scene, sppi) -> None:
         if sppi > 0 and any(e.flags() & mi.EmitterFlags.Delta for e in scene.emitters()):
-            self._warn_once("the derivative lacks the motion of the hard shadows of point, spot and directional lights; "
-                            'give them a size, or set "sppi" to 0 to accept this.')
+            self._warn_once(
+                "the derivative lacks the motion of the hard shadows of point, spot and directional lights; "
+                'give them a size, or set "sppi" to 0 to accept this.'
+            )
         if sppi > 0 and any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes()):
-            self._warn_once("the derivative lacks the motion of edges seen in perfect mirrors and glass; "
-                            'give them a roughness, or set "sppi" to 0 to accept this.')
+            self._warn_once(
+                "the derivative lacks the motion of edges seen in perfect mirrors and glass; "
+                'give them a roughness, or set "sppi" to 0 to accept this.'
+            )
         textures = jumping_textures(scene)
         if textures:
-            self._warn_once(f"the derivative lacks the jumps of the textures {', '.join(textures)}; use a bilinear bitmap.")
+            self._warn_once(
+                f"the derivative lacks the jumps of the textures {', '.join(textures)}; use a bilinear bitmap."
+            )
 
     def _warn_once(self, message: str) -> None:
         if message not in self._warned:
@@ -219,7 +245,8 @@ class EdgeIntegrator(ADIntegrator):
 
     @staticmethod
     def _override(own: int | None, spp: int, sensor: mi.Sensor) -> int:
-        """0 in the scene file switches a term off; otherwise the call comes before the scene file, and that before the sampler."""
+        """0 in the scene file switches a term off; otherwise the call comes before the scene file, and that before the
+        sampler."""
         return 0 if own == 0 else spp or own or sensor.sampler().sample_count()
 
     @staticmethod
@@ -232,7 +259,9 @@ class EdgeIntegrator(ADIntegrator):
         spp = sampler.sample_count()
         count = int(np.prod(size)) * spp
         if count > 2**32:
-            raise RuntimeError(f"{count} samples in one wavefront exceed 2^32: use fewer samples per pixel and average several seeds")
+            raise RuntimeError(
+                f"{count} samples in one wavefront exceed 2^32: use fewer samples per pixel and average several seeds"
+            )
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, count)
         return sampler, spp

@@ -20,7 +20,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
 
      * - sppc
        - |int|
-       - Samples per pixel of the interior derivative. 0 switches it off; otherwise the ``spp`` argument of the render call overrides it.
+       - Samples per pixel of the interior derivative. 0 switches it off; otherwise the ``spp`` argument of the render
+       call overrides it.
          Default: that argument, or the sampler's ``sample_count``.
 
      * - sppp
@@ -29,23 +30,29 @@ class DirectEdgeIntegrator(EdgeIntegrator):
 
      * - sppi
        - |int|
-       - Samples per pixel of the boundaries at shading points (shadows, reflections). They are not computed yet: unless this is 0, the
+       - Samples per pixel of the boundaries at shading points (shadows, reflections). They are not computed yet:
+       unless this is 0, the
          integrator warns once when something moves that could need them.
 
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: no)
 
-    Renders what ``path`` renders at ``max_depth`` 2, and differentiates it with respect to vertex positions, ``to_world`` of rectangles, the
+    Renders what ``path`` renders at ``max_depth`` 2, and differentiates it with respect to vertex positions,
+    ``to_world`` of rectangles, the
     camera (``to_world``, ``x_fov``, principal point, lens), lights, materials and textures.
 
-    The interior derivative holds the film position of a camera ray, and the *material point* of a light sample: a light that moves takes
-    its samples along (as in path-space differentiation, Zhang et al. 2020). So it needs no boundary unless something occludes it.
+    The interior derivative holds the film position of a camera ray, and the *material point* of a light sample: a
+    light that moves takes
+    its samples along (as in path-space differentiation, Zhang et al. 2020). So it needs no boundary unless something
+    occludes it.
 
-    **Limits.** Only triangle meshes can move: a moving sphere, curve, instance, ... is refused, and so is a camera that moves past one. The
-    edges of shadows, and edges seen in reflections, have no derivative yet. Nor have textures that jump (``checkerboard``, ``nearest``
-    filters) at their jumps. Polarised variants are refused. With filters other than ``box``, the ratio of sums that makes a pixel has a
-    bias of order 1/spp, as it has in the image.
+    **Limits.** Only triangle meshes can move: a moving sphere, curve, instance, ... is refused, and so is a camera
+    that moves past one. The
+    edges of shadows, and edges seen in reflections, have no derivative yet. Nor have textures that jump
+    (``checkerboard``, ``nearest``
+    filters) at their jumps. Polarised variants are refused. With filters other than ``box``, the ratio of sums that
+    makes a pixel has a bias of order 1/spp, as it has in the image.
 
     .. tabs::
         .. code-tab:: xml
@@ -67,7 +74,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     def sample(self, mode, scene, sampler, ray, active=True, beyond_horizon=False, **_):
         """Estimate the radiance along camera rays. Call it with gradients suspended: it resumes them where they belong.
 
-        beyond_horizon : turn shading normals that face away from a visible face back to its horizon, see `_up_to_horizon`.
+        beyond_horizon : turn shading normals that face away from a visible face back to its horizon, see
+            `_up_to_horizon`.
 
         Returns
         -------
@@ -105,7 +113,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
         return L, valid, [], None
 
     def sample_shading_boundary(self, scene, sampler, ray, boundaries):
-        """Derivative of the reflected light by the edges seen from the first hits: mi.Spectrum, (N,), zero with a gradient."""
+        """Derivative of the reflected light by the edges seen from the first hits: mi.Spectrum, (N,), zero with a
+        gradient."""
         pi = self._first_hit(scene, ray, True)
         with dr.resume_grad():
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -123,8 +132,10 @@ class DirectEdgeIntegrator(EdgeIntegrator):
 def _up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
     """Turn interpolated normals that face away from the viewer, on a face that does not, until they just face them.
 
-    Just inside of the silhouette of a smooth-shaded mesh such normals make a black fringe, whose inner border is a jump that lies on no edge.
-    The finer the mesh, the narrower the fringe: its two borders are taken together, as one jump from the background to the surface beside it.
+    Just inside of the silhouette of a smooth-shaded mesh such normals make a black fringe, whose inner border is a
+    jump that lies on no edge.
+    The finer the mesh, the narrower the fringe: its two borders are taken together, as one jump from the background to
+    the surface beside it.
     """
     to_viewer = -ray.d
     side = dr.sign(dr.dot(si.n, to_viewer))
@@ -139,7 +150,8 @@ def _up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
 class _Lights:
     """Direct illumination by multiple importance sampling, attached to light, surface and material where wanted.
 
-    Of a light sample, the *material point* y is held fixed. With the solid angle written as area, dω = |cos θ_y| dA(y) / r², its estimate is
+    Of a light sample, the *material point* y is held fixed. With the solid angle written as area,
+    dω = |cos θ_y| dA(y) / r², its estimate is
 
         f(ω) |cos θ_x| Lₑ(y, −ω) · |cos θ_y| dA / r²  /  p(ω),      ω = (y − x) / r,
 
@@ -188,7 +200,9 @@ class _Lights:
             direction = dr.select(on_surface, ω, ds.d)
             # Lights at infinity: the direction is fixed.
             elsewhere = scene.eval_emitter_direction(si, ds, active & ~on_surface & ~ds.delta) / ds.pdf
-            attached = dr.select(on_surface, y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf), elsewhere)
+            attached = dr.select(
+                on_surface, y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf), elsewhere
+            )
             if self.any_delta:
                 moved, at_delta = scene.sample_emitter_direction(si, sample, False, active & ds.delta)
                 direction = dr.select(ds.delta, moved.d, direction)
@@ -230,7 +244,8 @@ class _Lights:
             return dr.select(active, weight * emitter.eval(y, active) * mis, 0)
 
     def _connect(self, si, pi, ray, active):
-        """The material point y that `pi` stands for, the direction ω from `si` to it, and |cos θ_y| dA / r² relative to its present value."""
+        """The material point y that `pi` stands for, the direction ω from `si` to it, and |cos θ_y| dA / r² relative
+        to its present value."""
         y = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
         d = y.p - si.p
         r2 = dr.squared_norm(d)

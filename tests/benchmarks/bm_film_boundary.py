@@ -145,13 +145,13 @@ class Bench:
         return image
 
     def _difference(self, spp: int, seed: int) -> mi.TensorXf:
-        """As the references are made, but from one run."""
-        images = []
-        for theta in (self.case.step, -self.case.step):
+        """As the references are made (they keep the half step), but from one run."""
+        images, step = [], self.case.step / 2
+        for theta in (step, -step):
             self.motion.apply(theta)
             images.append(render_stratified(self.scene, self.path, self.scene.sensors()[0], seed, spp))
         self.motion.apply(0.0)
-        return (images[0] - images[1]) / (2 * self.case.step)
+        return (images[0] - images[1]) / (2 * step)
 
     def timed(self, method: str, spp: int, seed: int) -> tuple[np.ndarray, float]:
         """Derivative, and seconds."""
@@ -231,7 +231,7 @@ def _equal_time(bench: Bench, peer: str, rows: list[Row], trials: int) -> EqualT
     """Double the samples of `direct_edge` up to 1024, and then its renders, until it takes as long as the peer."""
     row = {r.method: r for r in rows if r.spp == EQUAL_TIME_SPP}
     budget, spp = row[peer].seconds, EQUAL_TIME_SPP
-    median = lambda: float(np.median([bench.timed("direct_edge", spp, seed)[1] for seed in range(6)][1:]))  # noqa: E731
+    median = lambda: float(np.median([bench.timed("direct_edge", spp, seed)[1] for seed in range(6)][1:]))
     seconds = median()
     while 2 * seconds < budget and spp < 1024:
         spp *= 2
@@ -262,7 +262,7 @@ def header(quick: bool) -> dict[str, Any]:
     from rimlight.sys_info import sys_info
 
     info = sys_info()
-    git = lambda *args: subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True).stdout.strip()  # noqa: E731
+    git = lambda *args: subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True).stdout.strip()
     changed = bool(git("status", "--porcelain", "--", "edge_sampling", "plugins", "tests/cases.py"))
     return {
         "processor": info["processor"],
@@ -317,8 +317,9 @@ def markdown(result: dict[str, Any]) -> str:
         rows, reference = [Row(**r) for r in case["rows"]], case["reference"]
         lines += [
             "",
-            f"**{name}** ({rows[0].parameter}). {NOTES[name]} Reference: finite differences, step {reference['step']}, "
-            f"{reference['runs']} runs of {reference['spp']} spp; its own noise is {reference['noise']:.2%}.",
+            f"**{name}** ({rows[0].parameter}). {NOTES[name]}",
+            f"Reference: finite differences, half of step {reference['step']}, {reference['runs']} runs of "
+            f"{reference['spp']} spp; its own noise is {reference['noise']:.2%}.",
             "",
             *table(
                 {
