@@ -7,6 +7,7 @@ from .meshes import Geometry, jumping_textures
 from .motion import Motion, derivative_image
 from .projection import Projection
 from .shading_boundary import ShadingBoundary
+from .zscores import mean_and_error, z_scores
 
 __all__ = [
     "BoundarySamples",
@@ -22,4 +23,6 @@ __all__ = [
     "find_edges",
     "finite_differences",
     "jumping_textures",
+    "mean_and_error",
+    "z_scores",
 ]

@@ -201,7 +201,7 @@ class FilmBoundary:
 
 @dataclass(frozen=True)
 class _Segment:
-    """The visible part of an edge: the interval of its parameter, depths at its ends, and length on the film, pixels."""
+    """The visible part of an edge: interval of its parameter, depths at its ends, length on the film in pixels."""
 
     start: mi.Float
     end: mi.Float

@@ -6,9 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from zscores import mean_and_error, z_scores
 
-from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image
+from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image, mean_and_error, z_scores
 
 
 @pytest.fixture(autouse=True)

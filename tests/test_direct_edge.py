@@ -5,10 +5,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from zscores import mean_and_error, z_scores
 
 import rimlight.scenes
-from rimlight.edge_sampling import Motion, derivative_image
+from rimlight.edge_sampling import Motion, derivative_image, mean_and_error, z_scores
 from rimlight.edge_sampling.exr import read_exr
 
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from zscores import mean_and_error, z_scores
+
+from rimlight.edge_sampling import mean_and_error, z_scores
 
 
 @pytest.fixture

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
-from rimlight.edge_sampling import FiniteDifferences
+from rimlight.edge_sampling import FiniteDifferences, z_scores
 
 #: `check` fails above this mean z² (about 1 without any bias) ...
 MAX_MEAN_Z2 = 2.0
 
 #: ... or if more than this share of the values is beyond 5 standard errors: a bias may be confined to a few pixels.
 MAX_FAR = 0.003
-
-#: Share of the largest value around a pixel by which a finite step may falsify it.
-SMEARED = 0.04
 
 
 @dataclass(frozen=True)
@@ -48,24 +44,16 @@ class Comparison:
 
 
 def compare(derivative: np.ndarray, error: np.ndarray, reference: FiniteDifferences) -> Comparison:
-    """Compare two estimates, (H, W, C), in units of their joint standard error.
-
-    The standard error of a pixel is that of the most uncertain pixel around it: where few samples arrive, its own is
-    too small. And a finite step smears an edge over its path: some per cent of a value end up in the pixels around.
-    """
+    """Compare two estimates, (H, W, C), in units of their joint standard error, see `z_scores`."""
     f = reference.mean
-    around = lambda a: maximum_filter(a, size=(3, 3, 1))
     alive = (derivative != 0) | (f != 0)
     if not alive.any():
         return Comparison(0, 0, 0, 0, 0, 0, 0)
-    difference = np.abs(derivative - f)[alive]
-    noise = np.hypot(error, reference.standard_error)[alive]
-    magnitude = np.maximum(np.abs(f)[alive].mean(), np.finfo(np.float32).tiny)
-    allowed = around(np.hypot(np.hypot(error, reference.standard_error), SMEARED * np.abs(f)))[alive]
-    z = difference / np.hypot(allowed, 1e-3 * magnitude)  # rounding
-    total = magnitude * alive.sum()
+    z = np.abs(z_scores(derivative, error, f, reference.standard_error, reference.step_error))[alive]
+    noise = np.hypot(error, reference.standard_error)
+    total = max(float(np.abs(f).sum()), np.finfo(np.float32).tiny)
     return Comparison(
-        relative_l1=float(difference.sum() / total),
+        relative_l1=float(np.abs(derivative - f).sum() / total),
         noise_l1=float(np.sqrt(2 / np.pi) * noise.sum() / total),
         mean_z=float(z.mean()),
         max_z=float(z.max()),
