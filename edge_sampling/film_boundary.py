@@ -66,7 +66,7 @@ class FilmBoundary:
         sensor: mi.Sensor,
         sampler: mi.Sampler,
         count: int,
-        radiance: Callable[[mi.RayDifferential3f, mi.Sampler], tuple[mi.Spectrum, mi.Float]],
+        radiance: Callable[[mi.RayDifferential3f, mi.Sampler, mi.Bool], tuple[mi.Spectrum, mi.Float]],
     ) -> BoundarySamples:
         """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
 
@@ -74,8 +74,9 @@ class FilmBoundary:
         stratified number.
 
         sampler : seeded for `count` lanes.
-        radiance : maps rays to (L, alpha), detached. Called for both sides of the edge with equal random numbers, so
-            that an edge that is hidden, or across which nothing jumps, contributes next to nothing rather than noise.
+        radiance : maps (rays, sampler, active) to (L, alpha), detached. Called for both sides of the edge with equal
+            random numbers, so that an edge that is hidden, or across which nothing jumps, contributes next to nothing
+            rather than noise.
 
         Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by
         it.

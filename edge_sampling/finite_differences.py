@@ -42,6 +42,7 @@ class FiniteDifferences:
 
     @staticmethod
     def read(path: str | Path) -> FiniteDifferences:
+        """Read what `write` wrote; the settings come back as text."""
         layers, metadata = read_exr(path)
         return FiniteDifferences(layers[""], layers["standard_error"], layers["step_error"], metadata)
 

@@ -14,7 +14,6 @@ from rimlight.edge_sampling import (
     Edges,
     FilmBoundary,
     Geometry,
-    Projection,
     ShadingBoundary,
     find_edges,
     jumping_textures,
@@ -192,7 +191,8 @@ class EdgeIntegrator(ADIntegrator):
         with dr.resume_grad():
             geometry.refuse_moving_others(self.name)
             moving = geometry.moving()
-            camera_moves = Projection(sensor).attached
+            camera = mi.traverse(sensor)
+            camera_moves = any(dr.grad_enabled(value) for _, value in camera.items())
         if camera_moves and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
             raise RuntimeError(

@@ -1,7 +1,7 @@
 """Make the references of the derivative tests:  python tests/references/make.py [--missing | NAME ...]
 
-Central differences of `path` at 32 × 32, common random numbers, 12 runs of 16,384 stratified samples a pixel: about 30
-s each on two cores.
+Central differences of `path` at 32 × 32, common random numbers, 12 runs of 16,384 stratified samples a pixel:
+about 30 s each on two cores.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
 import drjit as dr
 import mitsuba as mi
 
-import rimlight  # noqa: F401  (first: it chooses the LLVM library)
 from rimlight.edge_sampling import Motion, finite_differences
 
 RUNS, SPP = 12, 16384  # four times the runs for a tolerance of 1 %

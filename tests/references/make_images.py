@@ -6,10 +6,10 @@ error.
 
 from pathlib import Path
 
+import rimlight.scenes  # isort: skip (first: it chooses the LLVM library)
 import mitsuba as mi
 import numpy as np
 
-import rimlight.scenes  # first: it chooses the LLVM library
 from rimlight.edge_sampling.exr import write_exr
 from rimlight.edge_sampling.finite_differences import render_stratified
 
