@@ -136,8 +136,8 @@ class EdgeIntegrator(ADIntegrator):
             terms.append(Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights))
 
         # At a pixel, the weights of the interior samples add up to `weights` times the integral of the filter. The
-        # film divides by that sum: so
-        # samples of boundaries, of weight zero, are normalised as the image is, for every filter.
+        # film divides by that sum: so samples of boundaries, of weight zero, are normalised as the image is, for every
+        # filter.
 
         # ---------------------- Film boundary ----------------------
 
@@ -183,11 +183,11 @@ class EdgeIntegrator(ADIntegrator):
 
     def _boundaries_of(self, scene, sensor, sppi) -> Boundaries | None:
         """The edges that can contribute, or None where nothing moves."""
-        if self._geometry is None or self._geometry.key() != Geometry.of(scene).key():
-            self._geometry = Geometry.of(scene)
-            self._edges = find_edges(self._geometry)
+        geometry = Geometry.of(scene)
+        if self._geometry is None or self._geometry.key() != geometry.key():
+            self._geometry = geometry
+            self._edges = find_edges(geometry)
             self._boundaries = {}
-        geometry = self._geometry
         with dr.resume_grad():
             geometry.refuse_moving_others(self.name)
             moving = geometry.moving()
@@ -201,9 +201,9 @@ class EdgeIntegrator(ADIntegrator):
             )
         if not camera_moves and not any(moving):
             return None
-        self._warn_of_limits(scene, sppi)
         key = (moving, camera_moves)
         if key not in self._boundaries:
+            self._warn_of_limits(scene, sppi)
             on_film = tuple(m or camera_moves for m in moving)
             edges = self._edges.of_meshes(np.array(on_film))
             self._boundaries[key] = Boundaries(
@@ -245,8 +245,7 @@ class EdgeIntegrator(ADIntegrator):
 
     @staticmethod
     def _override(own: int | None, spp: int, sensor: mi.Sensor) -> int:
-        """0 in the scene file switches a term off; otherwise the call comes before the scene file, and that before the
-        sampler."""
+        """0 in the scene file switches a term off. Else the call comes first, then the scene file, then the sampler."""
         return 0 if own == 0 else spp or own or sensor.sampler().sample_count()
 
     @staticmethod

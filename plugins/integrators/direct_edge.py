@@ -112,8 +112,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
         return L, valid, [], None
 
     def sample_shading_boundary(self, scene, sampler, ray, boundaries):
-        """Derivative of the reflected light by the edges seen from the first hits: mi.Spectrum, (N,), zero with a
-        gradient."""
+        """What the edges seen from the first hits do to their light: mi.Spectrum, (N,), zero, with a gradient."""
         pi = self._first_hit(scene, ray, True)
         with dr.resume_grad():
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -132,9 +131,8 @@ def _up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
     """Turn interpolated normals that face away from the viewer, on a face that does not, until they just face them.
 
     Just inside of the silhouette of a smooth-shaded mesh such normals make a black fringe, whose inner border is a
-    jump that lies on no edge.
-    The finer the mesh, the narrower the fringe: its two borders are taken together, as one jump from the background to
-    the surface beside it.
+    jump that lies on no edge. The finer the mesh, the narrower the fringe: its two borders are taken together, as one
+    jump from the background to the surface beside it.
     """
     to_viewer = -ray.d
     side = dr.sign(dr.dot(si.n, to_viewer))
