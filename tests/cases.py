@@ -23,6 +23,9 @@ class Case:
     motion : arguments of `Motion`.
     step : of the finite differences, in units of θ: a few hundredths of a pixel.
     tolerance : of the relative L1 error.
+    spp, seeds : of the derivative.
+    runs : of the finite differences.
+    largest_z : above 4 only where the method is known to be biased, and documented to be.
     integrator : properties of `direct_edge`.
     """
 
@@ -33,6 +36,8 @@ class Case:
     tolerance: float = 0.015
     spp: int = 256
     seeds: int = 16
+    runs: int = 12
+    largest_z: float = 4
     integrator: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -236,11 +241,14 @@ def near_plane() -> mi.Scene:
 DEPTH = {"key": "cube.vertex_positions", "direction": [0, 0, 1]}
 SIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0]}
 CAMERA_X = {"key": "sensor.to_world", "direction": [1, 0, 0]}
+CAMERA_UP = {"key": "sensor.to_world", "direction": [0, 1, 0]}
+UP = {"key": "torus.vertex_positions", "direction": [0, 1, 0]}
 CAMERA_Z = {"key": "sensor.to_world", "direction": [0, 0, 1]}
 CAMERA_TURN = {"key": "sensor.to_world", "rotate": [0, 1, 0.2]}
 FIELD_OF_VIEW = {"key": "sensor.x_fov", "direction": [1]}
 PRINCIPAL_POINT_X = {"key": "sensor.principal_point_offset_x", "direction": [1]}
 PRINCIPAL_POINT_Y = {"key": "sensor.principal_point_offset_y", "direction": [1]}
+FLOOR_TURN = {"key": "floor.to_world", "rotate": [1, 0, 0]}
 FOCUS = {"key": "sensor.focus_distance", "direction": [1]}
 CROP = {"width": 64, "height": 48, "crop_width": RES, "crop_height": RES, "crop_offset_x": 20, "crop_offset_y": 4}
 
@@ -281,8 +289,8 @@ def crop(rfilter: str = "box") -> Callable[[], mi.Scene]:
 
 
 CASES = [
-    Case("two_triangles_green", two_triangles, vertex("green", 1), 4e-3, tolerance=0.01, spp=1024),
-    Case("two_triangles_red", two_triangles, vertex("red", 1), 4e-3, tolerance=0.01, spp=1024),
+    Case("two_triangles_green", two_triangles, vertex("green", 1), 4e-3, tolerance=0.01, spp=1024, runs=48),
+    Case("two_triangles_red", two_triangles, vertex("red", 1), 4e-3, tolerance=0.01, spp=1024, runs=48),
     Case("cube_depth", cube(), DEPTH, 1e-2),
     Case("cube_turn", cube(), {"key": "cube.vertex_positions", "rotate": [0.2, 1, 0]}, 6e-3, tolerance=0.03, spp=1024),
     Case("cube_welded", cube(shape=welded_cube), DEPTH, 1e-2),
@@ -301,24 +309,24 @@ CASES = [
     Case("orthographic_camera", cube(orthographic, textured_cube), CAMERA_X, 5e-3, spp=1024),
     Case("thin_lens_cube", cube(thin_lens), SIDE, 1e-2, tolerance=0.02, spp=1024),
     Case("thin_lens_camera", cube(thin_lens), CAMERA_Z, 2e-2, tolerance=0.02, spp=1024),
-    Case("thin_lens_focus", cube(thin_lens), FOCUS, 4e-2, tolerance=0.03),
+    Case("thin_lens_focus", cube(thin_lens), FOCUS, 4e-2, tolerance=0.04),
     Case("gaussian_filter", filtered("gaussian"), SIDE, 6e-3),
     Case("tent_filter", filtered("tent"), SIDE, 6e-3),
     Case("mitchell_filter", filtered("mitchell"), SIDE, 6e-3),
-    Case("sample_border", cube(close_up_with_border), SIDE, 2e-3),
+    Case("sample_border", cube(close_up_with_border), SIDE, 4e-3, tolerance=0.02, spp=1024, runs=36),
     Case("crop_window", crop(), SIDE, 4e-3),
     Case("crop_window_camera", crop("gaussian"), PRINCIPAL_POINT_X, 1e-3),
-    Case("leaving_the_frame", cube(close_up), SIDE, 2e-3),
+    Case("leaving_the_frame", cube(close_up), SIDE, 4e-3, spp=1024, runs=36),
     Case("near_plane", near_plane, {"key": "floor.vertex_positions", "direction": [0.3, 1, 0]}, 2e-3),
     Case("near_plane_camera", near_plane, {"key": "sensor.to_world", "direction": [0.3, 1, 0.2]}, 2e-3),
     Case("near_plane_cut", cube(cut_open), SIDE, 4e-3),
     Case("near_plane_cut_camera", cube(cut_open), {"key": "sensor.to_world", "rotate": [0.3, 1, 0.3]}, 8e-4),
-    Case("smooth_torus", smooth_torus(), {"key": "torus.vertex_positions", "direction": [0, 1, 0]}, 6e-3, 0.03, 1024),
-    Case("smooth_torus_camera", smooth_torus(), {"key": "sensor.to_world", "direction": [0, 1, 0]}, 6e-3, 0.03, 1024),
-    Case("room_cube", room(), SIDE, 6e-3, tolerance=0.03, spp=1024),
-    Case("room_camera", room(), CAMERA_X, 6e-3, tolerance=0.03, spp=1024),
-    Case("room_light", room(), {"key": "light.to_world", "direction": [1, -0.5, 0]}, 1e-2, tolerance=0.03, spp=1024),
-    Case("room_floor_turns", room(), {"key": "floor.to_world", "rotate": [1, 0, 0]}, 2e-3, tolerance=0.03, spp=1024),
+    Case("smooth_torus", smooth_torus(), UP, 6e-3, tolerance=0.04, spp=1024, largest_z=7),
+    Case("smooth_torus_camera", smooth_torus(), CAMERA_UP, 6e-3, tolerance=0.04, spp=1024, largest_z=7),
+    Case("room_cube", room(), SIDE, 6e-3, tolerance=0.06, spp=1024),
+    Case("room_camera", room(), CAMERA_X, 6e-3, tolerance=0.06, spp=1024),
+    Case("room_light", room(), {"key": "light.to_world", "direction": [1, -0.5, 0]}, 1e-2, tolerance=0.06, spp=1024),
+    Case("room_floor_turns", room(), FLOOR_TURN, 6e-3, tolerance=0.03, spp=1024, runs=48),
 ]
 
 

@@ -1,7 +1,7 @@
 """Make the references of the derivative tests:  python tests/references/make.py [--missing | NAME ...]
 
-Central differences of `path` at 32 × 32, common random numbers, 12 runs of 16,384 stratified samples a pixel:
-about 30 s each on two cores.
+Central differences of `path` at 32 × 32, common random numbers, 12 runs of 16,384 stratified samples a pixel, or more
+(`Case.runs`): about 20 s each on two cores.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling import Motion, finite_differences
 
-RUNS, SPP = 12, 16384  # four times the runs for a tolerance of 1 %
+SPP = 16384
 
 
 def main(names: list[str]) -> None:
@@ -38,7 +38,7 @@ def main(names: list[str]) -> None:
             scene,
             Motion(scene, **c.motion),
             step=c.step,
-            runs=RUNS * (4 if c.tolerance <= 0.01 else 1),
+            runs=c.runs,
             spp=SPP,
             progress=True,
         )
