@@ -326,7 +326,7 @@ CASES = [
     Case("room_cube", room(), SIDE, 6e-3, tolerance=0.06, spp=1024),
     Case("room_camera", room(), CAMERA_X, 6e-3, tolerance=0.06, spp=1024),
     Case("room_light", room(), {"key": "light.to_world", "direction": [1, -0.5, 0]}, 1e-2, tolerance=0.06, spp=1024),
-    Case("room_floor_turns", room(), FLOOR_TURN, 6e-3, tolerance=0.03, spp=1024, runs=48),
+    Case("room_floor_turns", room(), FLOOR_TURN, 6e-3, tolerance=0.06, spp=1024, runs=48),
 ]
 
 
