@@ -162,6 +162,26 @@ def test_gradient_reaches_both_copies_of_a_split_vertex():
     assert max(np.count_nonzero(touched[place.ravel() == i]) for i in range(8)) > 1
 
 
+HARD = {
+    "in the plane of the eye": [[0, 1, -5], [1, 0, -5], [0, 0, -5]],
+    "behind the camera": [[0, 1, -7], [1, 0, -7], [0, 0, -7]],
+    "vertex at the eye": [[0, 0, -5], [1, 0, 0], [0, 1, 0]],
+    "edge on the line of sight": [[0, 0, -4], [0, 0, 0], [0, 1, 0]],
+    "no area": [[0, 0, 0], [1, 0, 0], [2, 0, 0]],
+    "larger than the frame": [[-9, -9, 0], [9, -9, 0], [0, 9, 0]],
+}
+
+
+@pytest.mark.parametrize("key", ["triangle.vertex_positions", "sensor.to_world"])
+@pytest.mark.parametrize("vertices", HARD.values(), ids=HARD.keys())
+def test_hard_geometry_gives_finite_gradients(key, vertices):
+    triangle = cases.mesh("triangle", vertices, [[0, 1, 2]], bsdf=cases.diffuse(0.5))
+    scene = cases.scene(sensor=cases.camera((0, 0, -5)), triangle=triangle, environment=cases.constant())
+    motion = Motion(scene, key, direction=[1, 0, 0])
+    assert np.isfinite(jacobian_times(scene, motion)).all()
+    assert np.isfinite(gradient(scene, motion, np.ones((cases.RES, cases.RES, 3), np.float32)))
+
+
 def test_without_interior_samples_the_filter_still_normalises():
     scene = cases.cube(lambda: cases.camera(film=cases.film("gaussian")))()
     motion = Motion(scene, **cases.SIDE)

@@ -8,7 +8,7 @@ import numpy as np
 
 from rimlight.edge_sampling import FiniteDifferences, z_scores
 
-#: `check` fails above this mean z² (about 1 without any bias) ...
+#: `check` fails above this mean z² (at most about 1 without any bias) ...
 MAX_MEAN_Z2 = 2.0
 
 #: ... or if more than this share of the values is beyond 5 standard errors: a bias may be confined to a few pixels.
