@@ -43,23 +43,21 @@ class Geometry:
         """For every mesh: do its vertices carry a gradient?"""
         return tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
 
-    def refuse_moving_others(self, who: str) -> None:
-        """Refuse derivatives with respect to shapes whose silhouettes are not known.
+    def refuse_moving_others(self, scene: mi.Scene, who: str) -> None:
+        """Refuse derivatives with respect to shapes whose silhouettes are not known, inside of shape groups, too.
 
         Raises
         ------
-        RuntimeError : a shape that is not a triangle mesh carries a gradient in one of its own parameters.
+        RuntimeError : a shape that is none of `meshes` carries a gradient in one of its own parameters.
         """
-        for shape in self.others:
-            params = mi.traverse(shape)
-            # Keys with a dot belong to the BSDF, the emitter or a texture of the shape.
-            own = [k for k in list(params.keys()) if "." not in k]
-            moved = [k for k in own if dr.grad_enabled(params[k])]
-            if moved:
+        known = {int(m.ptr) for m in self.meshes}
+        params = mi.traverse(scene)
+        for key, (_, _, node, _) in params.properties.items():
+            if isinstance(node, mi.Shape) and int(node.ptr) not in known and dr.grad_enabled(params[key]):
                 raise RuntimeError(
-                    f'{who}: shape "{shape.id()}" ({shape.class_name()}) moves ("{moved[0]}" carries a gradient), '
-                    "but its silhouettes cannot be sampled yet: only triangle meshes can move. "
-                    "Replace it by a mesh, or detach it."
+                    f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{key}" carries a gradient), but its '
+                    "silhouettes cannot be sampled yet: only triangle meshes outside of shape groups can move. "
+                    "Replace it by such a mesh, or detach it."
                 )
 
     def positions(self) -> mi.Float:
@@ -99,7 +97,7 @@ def has_interpolated_normals(mesh: Any) -> bool:
 
 def has_face_attributes(mesh: Any) -> bool:
     """Does the mesh carry attributes that are constant on a face, and so jump at each of its edges?"""
-    return any(k.startswith("face_") for k in list(mi.traverse(mesh).keys()))
+    return any(k.startswith("face_") for k, _ in mi.traverse(mesh).items())
 
 
 def _concat(buffers: list[mi.Float]) -> mi.Float:

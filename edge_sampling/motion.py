@@ -89,11 +89,9 @@ class Motion:
 
     def __str__(self) -> str:
         numbers = lambda a: "(" + ", ".join(f"{x:g}" for x in a) + ")"
-        return (
-            f"{self.key} along {numbers(self.direction)}"
-            if self.rotate is None
-            else f"{self.key} about {numbers(self.rotate)}"
-        )
+        how = f"along {numbers(self.direction)}" if self.rotate is None else f"about {numbers(self.rotate)}"
+        chosen = [] if self.moves is None or self.moves.all() else np.flatnonzero(self.moves)
+        return f"{self.key} {how}" + (f", vertices {', '.join(map(str, chosen))}" if len(chosen) else "")
 
     def apply(self, theta: mi.Float | float) -> None:
         """Set the parameter to p(θ) and update the scene; attached if `theta` is."""

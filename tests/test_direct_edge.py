@@ -252,6 +252,21 @@ def test_instances_must_stand_still():
         moving(scene, "copy.to_world", direction=[1, 0, 0])
 
 
+def test_meshes_in_a_shape_group_must_stand_still():
+    group = {"type": "shapegroup", "inner": cases.smooth_cube()}
+    copy = {"type": "instance", "r": {"type": "ref", "id": "group"}}
+    scene = cases.scene(sensor=cases.camera(), group=group, copy=copy, environment=cases.constant())
+    with pytest.raises(RuntimeError, match=r'"inner" \(Cube\) moves'):
+        moving(scene, "group.inner.vertex_positions", direction=[1, 0, 0])
+
+
+def test_a_point_light_that_moves_is_warned_about():
+    lamp = {"type": "point", "position": [0, 4, 0], "intensity": {"type": "rgb", "value": 5.0}}
+    scene = cases.cube(lamp=lambda: lamp)()
+    assert "hard shadows of point" in warnings_of(scene, "lamp.position", {}, direction=[1, 0, 0])
+    assert "hard shadows" not in warnings_of(scene, "lamp.position", {"sppi": 0}, direction=[1, 0, 0])
+
+
 def test_negative_sample_count_is_refused():
     with pytest.raises(RuntimeError, match='direct_edge: "sppi" must be a whole number >= 0, got -4'):
         integrator(sppi=-4)

@@ -105,9 +105,6 @@ class _OnMotion(_OnSensor):
             sensor=self.sensor,
         )
 
-    def describe(self, motion: Motion) -> str:
-        return f"{motion}, vertices {self.vertices}" if self.vertices else str(motion)
-
     def reference(
         self, scene: Any, motion: Motion, *, step: float, runs: int, spp: int, max_depth: int
     ) -> FiniteDifferences:
@@ -264,7 +261,7 @@ class Gradient(_OnMotion):
             "image",
         )
 
-        what = self.describe(motion)
+        what = str(motion)
         metadata = self.metadata(integrator=self.integrator, spp=self.spp, seed=self.seed, seconds=f"{seconds:.3f}")
         folder = _loading.make_folder(self.out)
         with _writing():
@@ -304,7 +301,7 @@ class FiniteDifferencesCommand(_OnMotion):
         seconds = f"{time.perf_counter() - start:.3f}"
         _loading.make_folder(self.out.parent)
         with _writing():
-            reference.write(self.out, self.metadata(motion=self.describe(motion), key=motion.key, seconds=seconds))
+            reference.write(self.out, self.metadata(motion=str(motion), key=motion.key, seconds=seconds))
         return 0
 
 
@@ -339,7 +336,7 @@ class Check(_OnMotion):
         scene = self.load()
         integrator = _loading.load_integrator(self.integrator)
         motion = self.load_motion(scene)
-        what = self.describe(motion)
+        what = str(motion)
 
         start = time.perf_counter()
         derivative, error = self._derivative(scene, integrator, motion)

@@ -19,6 +19,11 @@ from rimlight.edge_sampling import (
     jumping_textures,
 )
 
+HARD_SHADOWS = (
+    "the derivative lacks the motion of the hard shadows of point, spot and directional lights; "
+    'give them a size, or set "sppi" to 0 to accept this.'
+)
+
 
 @dataclass
 class Sample:
@@ -189,16 +194,20 @@ class EdgeIntegrator(ADIntegrator):
             self._edges = find_edges(geometry)
             self._boundaries = {}
         with dr.resume_grad():
-            geometry.refuse_moving_others(self.name)
+            geometry.refuse_moving_others(scene, self.name)
             moving = geometry.moving()
             camera = mi.traverse(sensor)
             camera_moves = any(dr.grad_enabled(value) for _, value in camera.items())
+            lights = [mi.traverse(e) for e in scene.emitters() if e.flags() & mi.EmitterFlags.Delta]
+            light_moves = any(dr.grad_enabled(p[k]) for p in lights for k in ("position", "to_world") if k in p)
         if camera_moves and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
             raise RuntimeError(
                 f"{self.name}: the camera moves past {names}, whose silhouettes cannot be sampled yet. "
                 "Replace them by meshes."
             )
+        if light_moves and sppi > 0:
+            self._warn_once(HARD_SHADOWS)
         if not camera_moves and not any(moving):
             return None
         key = (moving, camera_moves)
@@ -215,10 +224,7 @@ class EdgeIntegrator(ADIntegrator):
 
     def _warn_of_limits(self, scene, sppi) -> None:
         if sppi > 0 and any(e.flags() & mi.EmitterFlags.Delta for e in scene.emitters()):
-            self._warn_once(
-                "the derivative lacks the motion of the hard shadows of point, spot and directional lights; "
-                'give them a size, or set "sppi" to 0 to accept this.'
-            )
+            self._warn_once(HARD_SHADOWS)
         if sppi > 0 and any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes()):
             self._warn_once(
                 "the derivative lacks the motion of edges seen in perfect mirrors and glass; "
