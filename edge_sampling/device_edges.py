@@ -36,6 +36,33 @@ class DeviceEdges:
     def _points_of_side(self, positions, edge, side):
         return (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, self._ends[side][k], edge)) for k in (0, 1))
 
+    def normals(self, positions: mi.Float, edge: mi.UInt32) -> list[mi.Vector3f]:
+        """Normals of the faces on both sides, not normalised.
+
+        Both turn about the edge in the same sense: where the faces lie on the same side of the view plane, as seen
+        from somewhere, their normals point to the same side. The first is that of its face, as its vertices turn.
+        """
+        a, b = self.end_points(positions, edge)
+        opposite = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, o, edge)) for o in self._opposite]
+        return [dr.cross(b - a, o - a) for o in opposite]
+
+    def outward(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, across: mi.Vector3f) -> mi.Float:
+        """The side of a silhouette on which its faces are not: the sign of `across`, (N,); 0 where they are on both.
+
+        across : a direction across the edge and the line of sight, at the point p of the edge.
+        """
+        sides = []
+        for opposite in self._opposite:
+            o = dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, opposite, edge))
+            sides.append(dr.sign(dr.dot(o - p, across)))
+        return dr.select(sides[0] == sides[1], -sides[0], 0)
+
+    def normals_differ(self, normals: mi.Float, edge: mi.UInt32) -> mi.Float:
+        """By how much the vertex normals of the two sides differ at most."""
+        sides = [self._points_of_side(normals, edge, side) for side in (0, 1)]
+        differences = [dr.norm(n - m) for n, m in zip(*sides, strict=True)]
+        return dr.maximum(*differences)
+
     def is_boundary(
         self,
         positions: mi.Float,
@@ -57,24 +84,18 @@ class DeviceEdges:
         boundary = kind == int(EdgeKind.JUMP)
         if self._kinds <= {EdgeKind.JUMP}:
             return boundary
-        a, b = self.end_points(positions, edge)
+        a, _ = self.end_points(positions, edge)
         towards = -view if view is not None else eye - a
-        normal, sign = [], []
-        for opposite in self._opposite:
-            o = dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, opposite, edge))
-            # Both normals turn about the edge in the same sense: seen edge-on from both sides, faces that overlap have
-            # equal signs.
-            normal.append(dr.cross(b - a, o - a))
-            sign.append(dr.dot(normal[-1], towards))
+        normal, sign = self.normals(positions, edge), []
+        for n in normal:
+            sign.append(dr.dot(n, towards))
             # Rounding, and a lens that sees around the edge, leave the sign open: such an edge is taken.
-            boundary |= dr.abs(sign[-1]) <= dr.norm(normal[-1]) * (radius + 1e-6 * dr.norm(towards))
+            boundary |= dr.abs(sign[-1]) <= dr.norm(n) * (radius + 1e-6 * dr.norm(towards))
         boundary |= sign[0] * sign[1] > 0
         if geometry is not None and EdgeKind.FLAT in self._kinds:
             lengths = dr.squared_norm(normal[0]) * dr.squared_norm(normal[1])
             folded = dr.squared_norm(dr.cross(normal[0], normal[1])) > COPLANAR**2 * lengths
             boundary |= (kind == int(EdgeKind.FLAT)) & folded
         if geometry is not None and EdgeKind.SPLIT in self._kinds:
-            normals = geometry.normals()
-            for n0, n1 in zip(*(self._points_of_side(normals, edge, side) for side in (0, 1)), strict=True):
-                boundary |= (kind == int(EdgeKind.SPLIT)) & (dr.squared_norm(n0 - n1) > COPLANAR**2)
+            boundary |= (kind == int(EdgeKind.SPLIT)) & (self.normals_differ(geometry.normals(), edge) > COPLANAR)
         return boundary

@@ -42,21 +42,28 @@ class Edges:
     opposite : (E, 2), uint32; the third vertex of the face on each side.
     mesh     : (E, 2), uint32; index into `Geometry.meshes` of the face on each side.
     kind     : (E,), uint8; an `EdgeKind`.
-    open     : (E,), bool; only one face.
+    count    : (E,), uint32; number of faces.
+
+    The end points of the first side are in the order in which its face runs through them.
     """
 
     vertices: np.ndarray
     opposite: np.ndarray
     mesh: np.ndarray
     kind: np.ndarray
-    open: np.ndarray
+    count: np.ndarray
+
+    @property
+    def open(self) -> np.ndarray:
+        """Has the edge only one face? (E,), bool."""
+        return self.count == 1
 
     def __len__(self) -> int:
         return len(self.kind)
 
     def take(self, which: np.ndarray) -> Edges:
         """Some of the edges, by index or by mask."""
-        return Edges(self.vertices[which], self.opposite[which], self.mesh[which], self.kind[which], self.open[which])
+        return Edges(self.vertices[which], self.opposite[which], self.mesh[which], self.kind[which], self.count[which])
 
     def of_meshes(self, wanted: np.ndarray) -> Edges:
         """The edges that have a face in one of the meshes for which `wanted` (bool) holds."""
@@ -103,8 +110,10 @@ def find_edges(geometry: Geometry) -> Edges:
         weld, sides = rewelded, _pair_sides(rewelded, face)
 
     face0, corner0, face1, corner1, count = sides
-    i0, j0, o0 = _corners(face, weld, face0, corner0)
-    i1, j1, o1 = _corners(face, weld, face1, corner1)
+    i0, j0, o0 = _corners(face, face0, corner0)
+    i1, j1, o1 = _corners(face, face1, corner1)
+    turn = weld[i0] != weld[i1]
+    i1, j1 = np.where(turn, j1, i1), np.where(turn, i1, j1)
     mesh0, mesh1 = mesh_of_face[face0], mesh_of_face[face1]
 
     interpolated = np.array([meshes.has_interpolated_normals(m) for m in geometry.meshes])
@@ -121,13 +130,13 @@ def find_edges(geometry: Geometry) -> Edges:
         opposite=np.stack([o0, o1], 1).astype(np.uint32),
         mesh=np.stack([mesh0, mesh1], 1),
         kind=kind,
-        open=count == 1,
+        count=count.astype(np.uint32),
     )
 
 
 def _no_edges() -> Edges:
     none = np.zeros((0, 2), np.uint32)
-    return Edges(np.zeros((0, 2, 2), np.uint32), none, none, np.zeros(0, np.uint8), np.zeros(0, bool))
+    return Edges(np.zeros((0, 2, 2), np.uint32), none, none, np.zeros(0, np.uint8), np.zeros(0, np.uint32))
 
 
 def _weld_equal(point: np.ndarray) -> np.ndarray:
@@ -204,10 +213,6 @@ def _pair_sides(weld: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, ...]:
     return alive[h0 // 3], h0 % 3, alive[h1 // 3], h1 % 3, count
 
 
-def _corners(
-    face: np.ndarray, weld: np.ndarray, f: np.ndarray, k: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices of side k of faces f, in the order of their welded numbers, and the vertex opposite to it."""
-    i, j, opposite = face[f, k], face[f, (k + 1) % 3], face[f, (k + 2) % 3]
-    swap = weld[i] > weld[j]
-    return np.where(swap, j, i), np.where(swap, i, j), opposite
+def _corners(face: np.ndarray, f: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices of side k of faces f, and the vertex opposite to it."""
+    return face[f, k], face[f, (k + 1) % 3], face[f, (k + 2) % 3]

@@ -22,7 +22,7 @@ import numpy as np
 from .device_edges import DeviceEdges
 from .edges import Edges
 from .meshes import Geometry
-from .projection import FilmPoint, Projection
+from .projection import FilmPoint, Projection, frame, inside_frame, tangent
 
 #: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
 #: an edge that cannot be seen changes nothing, not even the last bit.
@@ -90,7 +90,7 @@ class FilmBoundary:
             a, b = self._end_points(projection, positions, edge)
             segment = _clip(projection, projection.film(a), projection.film(b), sensor.film())
             t, dt = segment.parameter(along)
-            tangent = _tangent(projection, a, b, t, aperture_sample)
+            along_film = tangent(projection, a, b, t, aperture_sample)
 
         # Only here does the gradient enter: the velocity of a point that is fixed on the edge.
         with dr.resume_grad():
@@ -99,12 +99,15 @@ class FilmBoundary:
             velocity = u - dr.detach(u)
 
         with dr.suspend_grad():
-            n_dl = mi.Vector2f(-tangent.y, tangent.x) * (dt / density)
+            n_dl = mi.Vector2f(-along_film.y, along_film.x) * (dt / density)
             n = dr.normalize(n_dl)
             u = dr.detach(u)
             offset = self._offset(projection, dr.lerp(a, b, t)) * n
             active = (
-                (density > 0) & (segment.length > 0) & dr.isfinite(dr.squared_norm(n_dl)) & _inside(u, sensor.film())
+                (density > 0)
+                & (segment.length > 0)
+                & dr.isfinite(dr.squared_norm(n_dl))
+                & inside_frame(u, sensor.film())
             )
             time = sensor.shutter_open()
             if sensor.shutter_open_time() > 0:
@@ -219,7 +222,7 @@ class _Segment:
 
 def _clip(projection: Projection, a: FilmPoint, b: FilmPoint, film: mi.Film) -> _Segment:
     """Clip edges to near and far planes and to the frame plus the blur of the lens (Liang and Barsky 1984)."""
-    lower, upper = _frame(film)
+    lower, upper = frame(film)
     blur_a, blur_b = projection.blur(a), projection.blur(b)
     start, end = mi.Float(0), mi.Float(1)
     near, far = projection.near * (1 - 1e-4), projection.far  # cuts lie on the near plane, but for rounding
@@ -236,25 +239,3 @@ def _clip(projection: Projection, a: FilmPoint, b: FilmPoint, film: mi.Film) -> 
     length = dr.select(start < end, dr.norm(q.position() - p.position()), 0)
     # Written so that NaN, as from vertices that are not finite, counts as invisible.
     return _Segment(start, end, p.w, q.w, dr.select((length > 0) & dr.isfinite(length), length, 0))
-
-
-def _frame(film: mi.Film) -> tuple[mi.ScalarPoint2f, mi.ScalarPoint2f]:
-    """The part of the film that is sampled, in pixels: the crop window, and the border if the film asks for it."""
-    border = film.rfilter().border_size() if film.sample_border() else 0
-    lower = mi.ScalarPoint2f(film.crop_offset()) - border
-    return lower, lower + mi.ScalarVector2f(film.crop_size()) + 2 * border
-
-
-def _inside(u: mi.Point2f, film: mi.Film) -> mi.Bool:
-    lower, upper = _frame(film)
-    return dr.all((u >= lower) & (u < upper))
-
-
-def _tangent(
-    projection: Projection, a: mi.Point3f, b: mi.Point3f, t: mi.Float, aperture_sample: mi.Point2f | None
-) -> mi.Vector2f:
-    """du/dt along the edges, in pixels: derivative of a quotient of two linear functions."""
-    p, q = projection.film(a, aperture_sample), projection.film(b, aperture_sample)
-    w = dr.lerp(p.w, q.w, t)
-    u = dr.lerp(p.xy, q.xy, t) / w
-    return mi.Vector2f((q.xy - p.xy) - u * (q.w - p.w)) / w

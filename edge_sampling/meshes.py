@@ -64,6 +64,10 @@ class Geometry:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
         return _concat([m.vertex_positions_buffer() for m in self.meshes])
 
+    def host_positions(self) -> np.ndarray:
+        """Vertex positions of all meshes: (V, 3), world space, on the host."""
+        return np.concatenate([vertices(m) for m in self.meshes]) if self.meshes else np.zeros((0, 3), np.float32)
+
     def normals(self) -> mi.Float:
         """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Detached."""
         return _concat(

@@ -115,3 +115,25 @@ class Projection:
         if self.orthographic:
             scale *= dr.norm(dr.detach(self.to_local) @ mi.Vector3f(0, 1, 0))
         return scale / dr.abs(point.w)
+
+
+def frame(film: mi.Film) -> tuple[mi.ScalarPoint2f, mi.ScalarPoint2f]:
+    """The part of the film that is sampled, in pixels: the crop window, and the border if the film asks for it."""
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    lower = mi.ScalarPoint2f(film.crop_offset()) - border
+    return lower, lower + mi.ScalarVector2f(film.crop_size()) + 2 * border
+
+
+def inside_frame(u: mi.Point2f, film: mi.Film) -> mi.Bool:
+    lower, upper = frame(film)
+    return dr.all((u >= lower) & (u < upper))
+
+
+def tangent(
+    projection: Projection, a: mi.Point3f, b: mi.Point3f, t: mi.Float, aperture_sample: mi.Point2f | None
+) -> mi.Vector2f:
+    """du/dt along the edges, in pixels: derivative of a quotient of two linear functions."""
+    p, q = projection.film(a, aperture_sample), projection.film(b, aperture_sample)
+    w = dr.lerp(p.w, q.w, t)
+    u = dr.lerp(p.xy, q.xy, t) / w
+    return mi.Vector2f((q.xy - p.xy) - u * (q.w - p.w)) / w

@@ -1,4 +1,4 @@
-"""Boundaries at shading points: what edges add to the derivative of reflected light as they move past a light, seen
+"""Boundaries at shading points: what edges add to the derivative of reflected light as they move past what is seen
 from the point.
 
 At a point x, the integrand of L = ∫ f |cos θ| Lᵢ(ω) dω jumps at the great-circle arcs that the edges subtend. The
@@ -6,106 +6,320 @@ derivative of L gains
 
     ∮ f |cos θ| · Σ_sides ± L_side · n · (ω̇_edge − ω̇_side) dl,        n dl = (ω × dω/dt) dt = (ω × e′(t)) / r dt
 
-with ω = (e(t) − x) / r. A side's own velocity ω̇_side is that of its *material point*, since this is what the interior
-derivative holds fixed; it is 0 for a side at infinity. So an emitter contributes nothing by its own outline, but all
-that it loses behind another edge.
+with ω = (e(t) − x) / r. ω̇_side is what the interior derivative holds fixed on that side. For emitted light, this is the
+*material point* that emits. So neither an emitter nor the face beside the edge contributes by its own motion, only what
+is seen past the edge. For scattered light it is the point *in space* that scatters, as seen from a moving x.
+
+Edges are found in two ways. *From points*: at a shading point of a path, by a descent of the edge tree. *From lights*:
+from a point on a light, by the same descent; the shading point is then where the shadow of the edge falls, if the
+sensor sees it. Only the second finds the shadows that small lights cast. Emitted light that both find is divided as
+between the sampling of lights and of the BSDF in path tracing.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .device_edges import DeviceEdges
+from .edge_importance import EdgeSample, View, sample_edge
+from .edge_tree import EdgeTree
 from .edges import Edges
 from .meshes import Geometry
+from .projection import Projection, inside_frame, tangent
+
+#: Scattered radiance of a point that a ray meets: called with the ray, what it meets, a sampler, a mask.
+Scattered = Callable[[Any, Any, Any, Any], Any]
+
+
+@dataclass
+class LightSamples:
+    """Samples of the shadows that edges cast. The contribution to the image is `value` at `position`.
+
+    position : mi.Point2f, (N,), film position in pixels. Detached.
+    value : mi.Spectrum, (N,), zero, with the gradient of the radiance integrated over the film, in pixels², divided by
+        the number of samples; attached.
+    wavelengths : mi.Spectrum, (N,), nm.
+    """
+
+    position: mi.Point2f
+    value: mi.Spectrum
+    wavelengths: mi.Spectrum
 
 
 class ShadingBoundary:
-    """Samples the edges of a scene as shading points see them. Edges are chosen in proportion to their length in
-    space, wherever they are.
-
-    Unbiased, but noisy where a mesh has many edges of which few matter at a point.
+    """Samples the edges of a scene as shading points see them.
 
     Parameters
     ----------
-    geometry : the meshes.
+    scene : mi.Scene
+    geometry : its meshes.
     edges : all their edges, on the host.
     moving : for every mesh, does it move?
+    everything : do all edges matter at all points, since the camera or a light moves? Otherwise at points that stand
+        still only moving edges do.
+    radiance : does scattered light count, or only emitted light?
     """
 
-    def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...]):
+    def __init__(
+        self,
+        scene: mi.Scene,
+        geometry: Geometry,
+        edges: Edges,
+        moving: tuple[bool, ...],
+        *,
+        everything: bool,
+        radiance: bool,
+    ):
         self.geometry = geometry
         self.moving_meshes = [m for m, moves in zip(geometry.meshes, moving, strict=True) if moves]
-        # Static points that see static lights are concerned by moving edges only: put these first.
-        moves = np.array(moving)[edges.mesh].any(axis=1)
-        self.edges = DeviceEdges(edges.take(np.argsort(~moves, kind="stable")))
-        self.moving_count = int(moves.sum())
-        self.lights_move = any(m.is_emitter() for m in self.moving_meshes)
+        self.everything = everything
+        moves = np.array(moving)[edges.mesh].any(axis=1) if not everything else np.ones(len(edges), bool)
+        self.groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
+        self.tree = EdgeTree(geometry, edges, self.groups, radiance)
+        emitters = scene.emitters()
+        surface = [i for i, e in enumerate(emitters) if e.flags() & mi.EmitterFlags.Surface]
+        self.surface_lights = mi.UInt32(surface)
+        self.from_lights_possible = bool(surface)
+        flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
+        self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
+        glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
+        others = any(not e.flags() & (mi.EmitterFlags.Delta | mi.EmitterFlags.Surface) for e in emitters)
+        #: Is emitted light sampled from points, too? Diffuse surfaces find the lights themselves, from the lights.
+        self.emission_from_points = glossy or others
 
-    def sample(
-        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, camera_moves: bool
+    def refit(self) -> None:
+        """Follow the vertices. To be called before sampling."""
+        self.tree.refit(dr.detach(self.geometry.positions()))
+
+    # ---------------------- From points ----------------------
+
+    def from_points(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+        *,
+        share_emission: mi.Bool | bool,
+        emission: mi.Bool | bool = True,
+        scattered: Scattered | None = None,
     ) -> mi.Spectrum:
-        """One sample of the boundary integral at each of `si`, for emitted light only.
+        """One sample of the boundary integral at each of `si`.
 
         si : attached to whatever moves it.
+        share_emission : where lights of finite size are sampled from the lights, too.
+        emission : where emitted light counts at all.
+        scattered : where given, scattered light counts.
 
         Returns
         -------
         mi.Spectrum, (N,): zero, with the gradient of the reflected radiance.
         """
-        edges = self.edges
+        with dr.suspend_grad():
+            bsdf = si.bsdf()
+            moves = mi.Bool(self.everything)
+            for mesh in self.moving_meshes:
+                moves |= si.shape == mi.ShapePtr(mesh)
+            active = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            bs, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
+            found = active & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            peak = dr.select(found, bs.pdf, 0)
+            diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+            facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
+            view = View(
+                mi.Vector3f(si.p - self.tree.centre),
+                facing,
+                dr.select(diffuse, dr.inv_pi, 0.1 * dr.inv_pi),
+                dr.select(found, si.to_world(bs.wo), mi.Vector3f(0, 0, 1)),
+                peak,
+                # As wide as a lobe of that density.
+                dr.clip(dr.rsqrt(dr.pi * dr.maximum(peak, 1e-3)), 1e-5, 1),
+            )
+            use = [True, moves] if len(self.groups) == 2 else [True]
+            e = sample_edge(self.tree, view, sampler, use, from_light=False, active=active)
+        weight = lambda a, b: dr.select(share_emission, _share(b, a), 1)
+        return self._evaluate(scene, si, e, sampler, active, weight, emission=emission, scattered=scattered)
+
+    # ---------------------- From lights ----------------------
+
+    def from_lights(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        sampler: mi.Sampler,
+        first_hit: Callable[[mi.Scene, mi.Ray3f, mi.Bool], mi.PreliminaryIntersection3f],
+    ) -> LightSamples:
+        """Sample points on lights, edges as seen from them, and the points on which their shadows fall.
+
+        first_hit : what a camera ray meets.
+        """
+        count = sampler.wavefront_size()
+        with dr.resume_grad():
+            projection = Projection(sensor)
+        with dr.suspend_grad():
+            # ---------------------- A point on a light ----------------------
+
+            lights = dr.width(self.surface_lights)
+            which = dr.minimum(mi.UInt32(sampler.next_1d() * lights), lights - 1)
+            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.surface_lights, which))
+            time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
+            y, _ = emitter.sample_position(time, sampler.next_2d())
+            active = (y.pdf > 0) & dr.isfinite(y.pdf)
+
+            # ---------------------- An edge as seen from there ----------------------
+
+            zero = dr.zeros(mi.Float, count)
+            view = View(mi.Vector3f(y.p - self.tree.centre), y.n, zero + 1, mi.Vector3f(0, 0, 1), zero, zero + 1)
+            e = sample_edge(self.tree, view, sampler, [True] * len(self.groups), from_light=True, active=active)
+            active &= e.density > 0
+            positions = dr.detach(self.geometry.positions())
+            a, b = self.tree.device_edges.end_points(positions, e.edge)
+            p = dr.lerp(a, b, e.t)
+            ω = dr.normalize(p - y.p)
+            cos_y = dr.dot(y.n, ω)
+            across = dr.normalize(dr.cross(ω, b - a))
+            outward = self.tree.device_edges.outward(positions, e.edge, p, across)
+            active &= (cos_y > 0) & (outward != 0)
+
+            # ---------------------- Where its shadow falls ----------------------
+
+            offset = _offset(p, y.p)
+            shadow = mi.Ray3f(mi.Point3f(p + outward * offset * across), ω, time, [])
+            pi = scene.ray_intersect_preliminary(shadow, active=active)
+            active &= pi.is_valid()
+            x = shadow(pi.t)
+
+            # ---------------------- Does the sensor see it? ----------------------
+
+            aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
+            film_point = projection.film(x, aperture_sample)
+            u = dr.detach(film_point.position())
+            active &= (
+                inside_frame(u, sensor.film()) & (film_point.z > projection.near) & (film_point.z < projection.far)
+            )
+            wavelength_sample = sampler.next_1d() if mi.is_spectral else 0.0
+            with dr.resume_grad():
+                ray, ray_weight = sensor.sample_ray_differential(
+                    time,
+                    wavelength_sample,
+                    (u - projection.crop_offset) / projection.crop_size,
+                    mi.Point2f(0.5) if aperture_sample is None else aperture_sample,
+                    active,
+                )
+            seen = first_hit(scene, ray, active)
+            active &= seen.is_valid() & (seen.shape == pi.shape)
+            with dr.resume_grad():
+                si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            active &= dr.norm(si.p - x) <= 1e-3 * seen.t
+
+            # ---------------------- Density ----------------------
+
+            # Of the edge point, and of the film position: dA(y) cos θ_y / r_y² = dA(x) cos θ_x / r_x².
+            cos_x = dr.abs_dot(si.n, ω)
+            area = dr.squared_norm(y.p - p) * cos_x / (dr.squared_norm(si.p - p) * cos_y)
+            s, t = mi.coordinate_system(si.n)
+            along = [
+                tangent(projection, dr.detach(si.p), mi.Point3f(dr.detach(si.p) + v), mi.Float(0), aperture_sample)
+                for v in (s, t)
+            ]
+            pixels = dr.abs(along[0].x * along[1].y - along[0].y * along[1].x)
+            e.density *= y.pdf / lights * area / dr.detach(pixels) * count
+            active &= dr.isfinite(e.density) & (e.density > 0)
+
+        share = lambda a, b: _share(a, b) if self.emission_from_points else mi.Float(1)
+        value = self._evaluate(scene, si, e, sampler, active, share, target=(emitter, dr.norm(y.p - p)))
+        with dr.resume_grad():
+            return LightSamples(u, value * ray_weight, ray.wavelengths)
+
+    # ---------------------- Both ----------------------
+
+    def _evaluate(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        sample: EdgeSample,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+        emission_weight: Callable[[mi.Float, mi.Float], mi.Float],
+        *,
+        emission: mi.Bool | bool = True,
+        scattered: Scattered | None = None,
+        target: tuple[mi.EmitterPtr, mi.Float] | None = None,
+    ) -> mi.Spectrum:
+        """What a point on an edge does to the light that is reflected at `si`.
+
+        emission_weight : weight of emitted light, of the densities of its direction by light and by BSDF sampling.
+        target : only this emitter counts, at this distance behind the edge.
+        """
+        edges = self.tree.device_edges
         with dr.resume_grad():
             positions = self.geometry.positions()
         with dr.suspend_grad():
-            bsdf = si.bsdf()
-            everything = mi.Bool(camera_moves or self.lights_move)
-            for mesh in self.moving_meshes:
-                everything |= si.shape == mi.ShapePtr(mesh)
-            edge, density = self._choose(positions, sampler.next_1d(), everything)
-            t = sampler.next_1d()
-            a, b = edges.end_points(positions, edge)
-            x, p = si.p, dr.lerp(a, b, t)
-            active = si.is_valid() & (density > 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            active &= edges.is_boundary(positions, edge, x)
+            a, b = edges.end_points(positions, sample.edge)
+            x, p = si.p, dr.lerp(a, b, sample.t)
             distance = dr.norm(p - x)
             ω = (p - x) / distance
-            n_dl = dr.cross(ω, b - a) / (distance * density)
-            f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
-            active &= dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
-            # The two sides are looked at just beyond what single precision can tell apart.
-            ulp = 2 * dr.epsilon(mi.Float)
-            scale = dr.max(dr.maximum(dr.abs(mi.Vector3f(x)), dr.abs(mi.Vector3f(p))))
-            offset = dr.normalize(n_dl) * (16 * ulp * scale + 1e-5 * distance)
+            n_dl = dr.cross(ω, b - a) / (distance * sample.density)
+            f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
+            active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
+            across = dr.normalize(n_dl)
+            # Emitted light jumps only beside the faces of the edge.
+            sides = [mi.Float(-1), mi.Float(1)]
+            if scattered is None:
+                sides = [edges.outward(positions, sample.edge, p, across)]
+                active &= sides[0] != 0
+            offset = _offset(p, x) * across
+            n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
-            a, b = edges.end_points(positions, edge)
-            ω_edge = dr.normalize(dr.lerp(a, b, t) - si.p)
+            a, b = edges.end_points(positions, sample.edge)
+            edge_velocity = _turning(n_dl, dr.lerp(a, b, sample.t) - si.p, active)
             result = mi.Spectrum(0)
-            for sign in (-1, 1):
+            for side in sides:
                 with dr.suspend_grad():
                     # Mitsuba lifts the origin off the surface by more than the offset: aim from there.
-                    ray = si.spawn_ray_to(p + sign * offset)
+                    ray = si.spawn_ray_to(p + side * offset)
                     ray.maxt = dr.largest(mi.Float)
                     pi = scene.ray_intersect_preliminary(ray, active=active)
                 y = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-                ω_side = dr.normalize(y.p - si.p)
-                velocity = ω_edge - dr.detach(ω_edge) - dr.select(y.is_valid(), ω_side - dr.detach(ω_side), 0)
                 with dr.suspend_grad():
-                    L = f * y.emitter(scene, active).eval(y, active)
-                    L = dr.select(active, L, 0)
-                result -= sign * L * dr.dot(dr.select(active, n_dl, 0), velocity)
+                    emitter = y.emitter(scene, active)
+                    lit = active & (emitter != None)  # noqa: E711 (an array of pointers)
+                    if target is not None:
+                        lit &= (emitter == target[0]) & (dr.abs(pi.t - distance - target[1]) <= 1e-3 * pi.t)
+                    Le = emitter.eval(y, lit & emission)
+                    on_surface = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+                    light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), on_surface)
+                    Le *= dr.select(on_surface, emission_weight(light_pdf, pdf), 1)
+                    Le = dr.select(lit & emission, f * Le, 0)
+                valid = active & y.is_valid()
+                held = dr.select(valid, y.p, p)
+                result -= side * Le * (edge_velocity - _turning(n_dl, held - si.p, valid))
+                if scattered is not None:
+                    with dr.suspend_grad():
+                        Ls = dr.select(valid, f * scattered(ray, pi, sampler.clone(), valid), 0)
+                    result -= side * Ls * (edge_velocity - _turning(n_dl, dr.detach(held) - si.p, valid))
         return result
 
-    def _choose(self, positions: mi.Float, sample: mi.Float, everything: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
-        """Choose from all edges, or from the moving ones only: edge, and its probability."""
-        a, b = self.edges.end_points(positions, dr.arange(mi.UInt32, self.edges.count))
-        length = dr.norm(b - a)
-        length = dr.select(dr.isfinite(length), length, 0)
-        cumulative = dr.cumsum(mi.Float64(length))
-        last = dr.select(everything, self.edges.count, self.moving_count)
-        total = dr.gather(mi.Float64, cumulative, last - 1, last > 0)
-        x = mi.Float64(sample) * total
-        edge = dr.binary_search(0, self.edges.count - 1, lambda i: dr.gather(mi.Float64, cumulative, i) <= x)
-        return edge, dr.select(last > 0, mi.Float(dr.gather(mi.Float, length, edge) / total), 0)
+
+def _share(a: mi.Float, b: mi.Float) -> mi.Float:
+    """Weight of a strategy with density a against one with density b: the power heuristic."""
+    a2, b2 = dr.square(a), dr.square(b)
+    return dr.select(a2 > 0, a2 / (a2 + b2), 0)
+
+
+def _turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:
+    """Zero, with the gradient of the direction of d, along `n_dl`."""
+    ω = dr.normalize(dr.select(valid, d, mi.Vector3f(0, 0, 1)))
+    return dr.select(valid, dr.dot(n_dl, ω - dr.detach(ω)), 0)
+
+
+def _offset(p: mi.Point3f, q: mi.Point3f) -> mi.Float:
+    """How far beside an edge at p to look from q, or from p itself: just beyond what single precision can tell apart."""
+    scale = dr.max(dr.maximum(dr.abs(mi.Vector3f(p)), dr.abs(mi.Vector3f(q))))
+    return 32 * dr.epsilon(mi.Float) * scale + 1e-5 * dr.norm(p - q)

@@ -1,9 +1,10 @@
-"""What the integrators with edge sampling share: sample counts, the edges of a scene, and the way to a derivative
-image."""
+"""What the integrators with edge sampling share: the way from camera rays to radiance, and to a derivative image."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +19,9 @@ from rimlight.edge_sampling import (
     find_edges,
     jumping_textures,
 )
+
+from ._paths import Depths, Vertex, choose_vertex, replay, scattered_light
+from ._scattering import Scattering, up_to_horizon
 
 HARD_SHADOWS = (
     "the derivative lacks the motion of the hard shadows of point, spot and directional lights; "
@@ -40,6 +44,7 @@ class Term:
     value : attached; only its gradient counts.
     weight : of each sample in the film's weight channel.
     per_pixel : how many neighbours in the wavefront belong to one pixel, 0 if they are in no order.
+    replay : propagates the gradient of the loss with respect to `value.L` to what `value` is not attached to.
     """
 
     position: mi.Point2f
@@ -47,6 +52,7 @@ class Term:
     wavelengths: mi.Spectrum
     weight: float
     per_pixel: int
+    replay: Callable[[mi.Spectrum], Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -55,20 +61,19 @@ class Boundaries:
     does."""
 
     film: FilmBoundary
-    shading: ShadingBoundary
-    camera_moves: bool
+    shading: ShadingBoundary | None
 
 
 class EdgeIntegrator(ADIntegrator):
     """Base of the integrators whose derivative has an interior term, from `sample`, and a boundary term, from the
     edges of the scene.
 
-    A subclass provides ``sample(mode, scene, sampler, ray, active)`` and ``sample_shading_boundary(scene, sampler,
-    ray, boundaries)``, see `DirectEdgeIntegrator`.
+    max_depth, rr_depth : of paths, as in Mitsuba's `path`.
     """
 
-    def __init__(self, props: mi.Properties):
+    def __init__(self, props: mi.Properties, max_depth: int = 2, rr_depth: int = 5):
         super().__init__(props)
+        self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
         self.name = props.plugin_name()
         if mi.is_polarized:
             raise ValueError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
@@ -118,7 +123,108 @@ class EdgeIntegrator(ADIntegrator):
                     dr.set_grad(term.value, dr.grad(value))
                     dr.enqueue(dr.ADMode.Backward, term.value)
                 dr.traverse(dr.ADMode.Backward)
+            for term, value in zip(terms, values, strict=True):
+                if term.replay is not None:
+                    term.replay(dr.grad(value.L))
             dr.eval()
+
+    # ---------------------- Radiance ----------------------
+
+    def sample(self, mode, scene, sampler, ray, active=True, beyond_horizon=False, **_):
+        """Estimate the radiance along camera rays. Call it with gradients suspended: it resumes them where they belong.
+
+        beyond_horizon : turn shading normals that face away from a visible face back to its horizon, see
+            `up_to_horizon`.
+
+        Returns
+        -------
+        L : mi.Spectrum, (N,); unless `mode` is primal, attached to the first vertex of its path.
+        valid : mi.Bool, (N,); does the ray meet a surface, or a visible environment? The alpha channel.
+        aovs : empty; Mitsuba's interface has them.
+        replay : None, or what differentiates the rest of the path: called with the gradient of the loss with respect
+            to L, or in forward mode with None, when it returns the derivative.
+        """
+        attached = mode != dr.ADMode.Primal
+        active = mi.Bool(active)
+        L, rest = mi.Spectrum(0), None
+
+        # ---------------------- First hit ----------------------
+
+        # A surface that moves is met by a fixed ray; a ray that moves with the camera takes its hit along.
+        pi = self._first_hit(scene, ray, active)
+        with dr.resume_grad(when=attached):
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            if not self.hide_emitters and self.depths.max_depth > 0:
+                L += si.emitter(scene).eval(si, active)
+        if beyond_horizon:
+            up_to_horizon(si, ray)
+        bsdf = si.bsdf(ray)
+        valid = active & si.is_valid() & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+        if scene.environment() is not None and not self.hide_emitters:
+            valid |= active
+        active &= si.is_valid()
+        if not self.depths.scatters(1):
+            return L, valid, [], None
+
+        # ---------------------- Light that it scatters ----------------------
+
+        scattering = Scattering(scene, attached=attached, continues=self.depths.scatters(2))
+        direct, onwards = scattering.scatter(si, bsdf, sampler, active)
+        with dr.resume_grad(when=attached):
+            L += direct
+        if onwards is not None:
+            one = dr.full(mi.UInt32, 2, dr.width(L))
+            β = dr.select(active, dr.detach(onwards.weight), 0)
+            second = Vertex(mi.Ray3f(onwards.ray), onwards.pi, one, β, mi.Float(onwards.η))
+            again = sampler.clone() if attached else None
+            indirect = scattered_light(scene, sampler, second, self.depths, active)
+            with dr.resume_grad(when=attached):
+                L += dr.select(β != 0, indirect * onwards.weight / β, 0)
+            if attached:
+                rest = lambda δL: replay(scene, again, second, self.depths, active, indirect, δL)
+        return L, valid, [], rest
+
+    def _first_hit(self, scene, ray, active):
+        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        if self.hide_emitters:
+            skip = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array of pointers)
+            onwards = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip).spawn_ray(ray.d)
+            pi[skip] = self.skip_area_emitters(scene, onwards, True, skip)
+        return pi
+
+    def _beside_edge(self, scene, ray, sampler, active) -> tuple[mi.Spectrum, mi.Float]:
+        """Radiance and alpha beside an edge on the film."""
+        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=True)
+        return L, dr.select(valid, mi.Float(1), 0)
+
+    def _from_points(self, scene, sampler, ray, shading: ShadingBoundary) -> mi.Spectrum:
+        """What edges do to the light that one vertex of each path reflects: mi.Spectrum, (N,), zero, with a gradient."""
+        pi = self._first_hit(scene, ray, True)
+        first = Vertex(dr.detach(mi.Ray3f(ray)), pi, dr.full(mi.UInt32, 1, dr.width(pi.t)), mi.Spectrum(1), mi.Float(1))
+        vertex, chosen, scattered = first, pi.is_valid(), None
+        if self.depths.scatters(2):
+            vertex, chosen = choose_vertex(scene, sampler, first, self.depths, chosen)
+            scattered = lambda ray, pi, sampler, active: self._onwards(scene, vertex, ray, pi, sampler, active)
+        at_first = vertex.depth == 1
+        with dr.resume_grad():
+            own_ray = dr.select(at_first, mi.Ray3f(ray), vertex.ray)
+            si = vertex.pi.compute_surface_interaction(own_ray, mi.RayFlags.All, chosen)
+        L = shading.from_points(
+            scene,
+            si,
+            sampler,
+            chosen,
+            share_emission=at_first & shading.from_lights_possible,
+            emission=~at_first | shading.emission_from_points,
+            scattered=scattered,
+        )
+        with dr.resume_grad():
+            return L * vertex.β
+
+    def _onwards(self, scene, vertex, ray, pi, sampler, active) -> mi.Spectrum:
+        """Light that is scattered towards `vertex` by what `ray` meets past an edge."""
+        seen = Vertex(mi.Ray3f(ray), pi, vertex.depth + 1, dr.full(mi.Spectrum, 1, dr.width(active)), mi.Float(1))
+        return scattered_light(scene, sampler, seen, self.depths, active)
 
     # ---------------------- Derivative image ----------------------
 
@@ -136,9 +242,12 @@ class EdgeIntegrator(ADIntegrator):
         # Without interior samples, zeros still tell how much the filter weighs at each pixel.
         sampler, weights = self._sampler(sensor, seed, sppc or 16)
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
-        L = self.sample(mode, scene, sampler, ray)[0] if sppc > 0 else mi.Spectrum(0)
+        L, _, _, replay = self.sample(mode, scene, sampler, ray) if sppc > 0 else (mi.Spectrum(0), None, None, None)
         with dr.resume_grad():
-            terms.append(Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights))
+            if replay is not None and mode == dr.ADMode.Forward:
+                L += _with_gradient(replay(None))
+            adjoint = (lambda δ: replay(δ * dr.detach(ray_weight))) if replay is not None else None
+            terms.append(Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights, adjoint))
 
         # At a pixel, the weights of the interior samples add up to `weights` times the integral of the filter. The
         # film divides by that sum: so samples of boundaries, of weight zero, are normalised as the image is, for every
@@ -149,17 +258,25 @@ class EdgeIntegrator(ADIntegrator):
         if boundaries is not None and sppp > 0:
             sampler, _ = self._sampler(sensor, 0xFFFFFFFF ^ seed, sppp)
             s = boundaries.film.sample(
-                sensor, sampler, sampler.wavefront_size(), lambda *args: self._side(scene, *args)
+                sensor, sampler, sampler.wavefront_size(), lambda *args: self._beside_edge(scene, *args)
             )
             with dr.resume_grad():
                 terms.append(Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0))
 
         # ---------------------- Boundaries at shading points ----------------------
 
-        if boundaries is not None and sppi > 0 and scene.emitters():
-            sampler, sppi = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
+        shading = boundaries.shading if boundaries is not None and sppi > 0 else None
+        if shading is not None:
+            shading.refit()
+        if shading is not None and shading.from_lights_possible:
+            sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
+            s = shading.from_lights(scene, sensor, sampler, self._first_hit)
+            with dr.resume_grad():
+                terms.append(Term(s.position, Sample(s.value * weights, mi.Float(0)), s.wavelengths, 0.0, 0))
+        if shading is not None and (self.depths.scatters(2) or shading.emission_from_points):
+            sampler, sppi = self._sampler(sensor, 0x55555555 ^ seed, sppi)
             ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
-            L = self.sample_shading_boundary(scene, sampler, ray, boundaries)
+            L = self._from_points(scene, sampler, ray, shading)
             with dr.resume_grad():
                 L *= ray_weight * (weights / sppi)
                 terms.append(Term(position, Sample(L, mi.Float(0)), ray.wavelengths, 0.0, sppi))
@@ -178,11 +295,6 @@ class EdgeIntegrator(ADIntegrator):
             )
             film.put_block(block)
         return film.develop()
-
-    def _side(self, scene, ray, sampler, active) -> tuple[mi.Spectrum, mi.Float]:
-        """Radiance and alpha beside an edge."""
-        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=True)
-        return L, dr.select(valid, mi.Float(1), 0)
 
     # ---------------------- What moves ----------------------
 
@@ -217,10 +329,22 @@ class EdgeIntegrator(ADIntegrator):
             edges = self._edges.of_meshes(np.array(on_film))
             self._boundaries[key] = Boundaries(
                 FilmBoundary(geometry, edges, geometry.faces(on_film)),
-                ShadingBoundary(geometry, self._edges, moving),
-                camera_moves,
+                self._shading_boundary(scene, moving, camera_moves),
             )
         return self._boundaries[key]
+
+    def _shading_boundary(self, scene, moving, camera_moves) -> ShadingBoundary | None:
+        if not scene.emitters() or not len(self._edges) or not self.depths.scatters(1):
+            return None
+        lights_move = any(m.is_emitter() and moves for m, moves in zip(self._geometry.meshes, moving, strict=True))
+        return ShadingBoundary(
+            scene,
+            self._geometry,
+            self._edges,
+            moving,
+            everything=camera_moves or lights_move,
+            radiance=bool(self.depths.scatters(2)),
+        )
 
     def _warn_of_limits(self, scene, sppi) -> None:
         if sppi > 0 and any(e.flags() & mi.EmitterFlags.Delta for e in scene.emitters()):
@@ -270,3 +394,11 @@ class EdgeIntegrator(ADIntegrator):
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, count)
         return sampler, spp
+
+
+def _with_gradient(tangent: mi.Spectrum) -> mi.Spectrum:
+    """Zero, with the gradient `tangent`."""
+    x = dr.zeros(mi.Spectrum, dr.width(tangent))
+    dr.enable_grad(x)
+    dr.set_grad(x, tangent)
+    return x

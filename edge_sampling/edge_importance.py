@@ -1,0 +1,282 @@
+"""Choosing an edge, and a point on it, as a point of the scene sees them: a random descent of an `EdgeTree`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .edge_tree import EDGE_ON, LEAF, EdgeTree, Node, Slot
+
+#: Part of the length of a node that counts even where its moments promise no silhouette.
+FLOOR = 0.01
+
+
+@dataclass
+class View:
+    """From where the edges are looked at, and what is wanted of them.
+
+    p : mi.Vector3f, relative to the centre of the tree.
+    n : mi.Vector3f, unit normal: directions below its plane are of no use. Zero where all are.
+    wide : mi.Float, weight of all directions above the plane, by their cosine.
+    axis, peak, width : weight of directions ω near to a lobe's axis, peak · (1 + (tan θ / width)²)^(-3/2). Integrated
+        along a line, this has a closed form.
+    """
+
+    p: mi.Vector3f
+    n: mi.Vector3f
+    wide: mi.Float
+    axis: mi.Vector3f
+    peak: mi.Float
+    width: mi.Float
+
+
+@dataclass
+class EdgeSample:
+    """An edge, and a point on it.
+
+    edge : mi.UInt32, index of the edge.
+    t : mi.Float, the point is (1 - t) a + t b.
+    density : mi.Float, probability of the edge times density of t; 0 where no boundary was found.
+    """
+
+    edge: mi.UInt32
+    t: mi.Float
+    density: mi.Float
+
+
+def sample_edge(
+    tree: EdgeTree, view: View, sampler: mi.Sampler, use: list[mi.Bool | bool], *, from_light: bool, active: mi.Bool
+) -> EdgeSample:
+    """Descend the tree at random, in proportion to the importance of the children of each node; test the edges of the
+    leaf one by one; choose a point on one.
+
+    use : for each group of edges of the tree, whether to choose from it.
+    from_light : the importance of an edge falls off with the square of its distance, not with the distance itself.
+
+    Returns
+    -------
+    EdgeSample, (N,)
+    """
+    width = dr.width(view.p)
+    node, density = mi.UInt32(0), mi.Float(1)
+    bottom, node_offset, leaf_offset = mi.UInt32(1), mi.UInt32(0), mi.UInt32(0)
+
+    # ---------------------- Which group ----------------------
+
+    total, choice = mi.Float(0), mi.Float(sampler.next_1d(active))
+    for k, wanted in enumerate(use):
+        weight = mi.Float(1)
+        if len(use) > 1:
+            root = tree.node(mi.UInt32(tree.node_offsets[k] + 1))
+            weight = dr.select(wanted, importance(root, view, from_light), 0)
+        total += weight
+        p = dr.select(total > 0, weight / total, 0)
+        taken = choice < p
+        choice = dr.select(taken, choice / p, (choice - p) / (1 - p))
+        density = dr.select(taken, p, density * (1 - p))
+        bottom[taken], node_offset[taken] = 1 << tree.depths[k], tree.node_offsets[k]
+        leaf_offset[taken] = tree.leaf_offsets[k]
+    node = dr.full(mi.UInt32, 1, width)
+    alive = mi.Bool(active) & (total > 0)
+
+    # ---------------------- Down to a leaf ----------------------
+
+    if max(tree.depths) > 0:
+
+        def down(node, density, alive, sampler):
+            child = 2 * node
+            weights = [importance(tree.node(child + k + node_offset, alive), view, from_light) for k in (0, 1)]
+            total = weights[0] + weights[1]
+            alive &= total > 0
+            right = sampler.next_1d(alive) * total >= weights[0]
+            density = dr.select(alive, density * dr.select(right, weights[1], weights[0]) / total, 0)
+            return dr.select(alive, child + dr.select(right, mi.UInt32(1), mi.UInt32(0)), node), density, alive, sampler
+
+        node, density, alive, sampler = dr.while_loop(
+            (node, density, alive, sampler), lambda n, d, a, s: a & (n < bottom), down, label="edge tree"
+        )
+
+    # ---------------------- The edges of the leaf ----------------------
+
+    first = (node - bottom + leaf_offset) * LEAF
+    choice = sampler.next_1d(alive)
+
+    def test(k, total, chosen, weight, choice):
+        slot = tree.slot(first + k, alive)
+        w = edge_importance(slot, view, from_light)
+        total += w
+        p = dr.select(total > 0, w / total, 0)
+        taken = choice < p
+        choice = dr.select(taken, choice / p, (choice - p) / (1 - p))
+        return k + 1, total, dr.select(taken, k, chosen), dr.select(taken, w, weight), choice
+
+    state = (dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width), dr.zeros(mi.UInt32, width))
+    _, total, chosen, weight, _ = dr.while_loop(
+        (*state, dr.zeros(mi.Float, width), choice), lambda k, *_: alive & (k < LEAF), test, label="edges of a leaf"
+    )
+    alive &= total > 0
+    slot = first + chosen
+    t, pdf = _sample_point(tree.slot(slot, alive), view, from_light, sampler.next_1d(alive), sampler.next_1d(alive))
+    density = dr.select(alive, density * weight / total * pdf, 0)
+    return EdgeSample(dr.gather(mi.UInt32, tree.slot_edge, slot, alive), t, dr.select(dr.isfinite(density), density, 0))
+
+
+# ---------------------- Importance ----------------------
+
+
+def importance(node: Node, view: View, from_light: bool) -> mi.Float:
+    """About what the boundaries among the edges of a node contribute; 0 only where they certainly contribute nothing.
+
+    The number of sign changes of q·y among pairs of planes with mean μ, variance V, and a difference of second moment
+    D is, for normally distributed planes, √(D/V) / π · exp(−μ² / 2V), where μ, V, D stand for μ·y, yᵀVy and yᵀDy.
+    """
+    y = [*view.p, -1]
+    lower, upper = mi.Float(0), mi.Float(0)
+    for i in range(4):
+        s, t = node.plane_lower[i] * y[i], node.plane_upper[i] * y[i]
+        lower += dr.minimum(s, t)
+        upper += dr.maximum(s, t)
+    possible = (lower <= 0) & (upper >= 0)
+
+    quadratic = _quadratic(y)
+    variance = dr.maximum(quadratic(node.variance), dr.smallest(mi.Float))
+    difference = dr.maximum(quadratic(node.difference), 0)
+    mean = sum(m * x for m, x in zip(node.mean, y, strict=True))
+    # Planes are not normally distributed: this falls off like the exponential at first, but has a heavier tail.
+    tail = dr.rcp(dr.square(dr.square(1 + 0.125 * mean * mean / variance)))
+    silhouettes = dr.minimum(dr.sqrt(difference / variance) * dr.inv_pi * tail, 1)
+    length = node.creases + node.silhouettes * (silhouettes + FLOOR)
+
+    lower, upper = mi.Vector3f(node.lower), mi.Vector3f(node.upper)
+    half = 0.5 * (upper - lower)
+    d = 0.5 * (upper + lower) - view.p
+    size2 = dr.squared_norm(half)
+    r2 = dr.squared_norm(d) + size2
+    above = dr.dot(view.n, d) + dr.dot(dr.abs(view.n), half)
+    possible &= (above > 0) | dr.all(view.n == 0)
+    cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(above * dr.rsqrt(r2), 0, 1))
+    weight = view.wide * cosine
+    # How far from the axis of the lobe does the node begin?
+    along = dr.dot(view.axis, d)
+    off2 = dr.select(along > 0, dr.squared_norm(d) - along * along, r2)
+    gap2 = dr.square(dr.maximum(dr.safe_sqrt(off2) - dr.sqrt(size2), 0)) / r2
+    weight += view.peak * _lobe(gap2 / dr.square(view.width))
+    result = length * weight * (dr.rcp(r2) if from_light else dr.rsqrt(r2))
+    return dr.select(possible & (length > 0) & dr.isfinite(result), result, 0)
+
+
+def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
+    """What `importance` is for a node, for a single edge. Zero where that is no boundary."""
+    y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -1)
+    signs = [dr.dot(q, y) for q in slot.planes]
+    edge_on = EDGE_ON * dr.norm(slot.a - view.p)
+    silhouette = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
+    # Faces that both turn away are usually hidden by others.
+    crease = dr.select((signs[0] < 0) & (signs[1] < 0), 0.1, 1) * slot.crease
+    wide, narrow = _on_line(slot, view, from_light)
+    result = dr.select(silhouette, 1, crease) * (wide.total + narrow.total)
+    if from_light:
+        result *= dr.rsqrt(dr.squared_norm(0.5 * (slot.a + slot.b) - view.p) + dr.squared_norm(slot.b - slot.a) / 12)
+    ends = [dr.dot(view.n, v - view.p) > EDGE_ON * dr.norm(v - view.p) for v in (slot.a, slot.b)]
+    above = ends[0] | ends[1] | dr.all(view.n == 0)
+    return dr.select(above & (dr.squared_norm(slot.b - slot.a) > 0) & dr.isfinite(result), result, 0)
+
+
+def _quadratic(y):
+    products = [(1 if i == j else 2) * y[i] * y[j] for i in range(4) for j in range(i, 4)]
+    return lambda m: sum(a * b for a, b in zip(m, products, strict=True))
+
+
+def _lobe(x: mi.Float) -> mi.Float:
+    """(1 + x)^(-3/2)"""
+    r = dr.rsqrt(1 + x)
+    return r * r * r
+
+
+# ---------------------- The point on the edge ----------------------
+
+
+@dataclass
+class _Wide:
+    """Density of a point on an edge in proportion to the angle under which it is seen.
+
+    With s along the line from the foot of the perpendicular from the viewer, of length h: s = h tan φ.
+    """
+
+    foot: mi.Float
+    h: mi.Float
+    start: mi.Float
+    angle: mi.Float
+    total: mi.Float
+
+    def sample(self, u: mi.Float) -> mi.Float:
+        return self.foot + self.h * dr.tan(self.start + u * self.angle)
+
+    def pdf(self, s: mi.Float) -> mi.Float:
+        return self.h / (self.angle * (dr.square(self.h) + dr.square(s - self.foot)))
+
+
+@dataclass
+class _Narrow:
+    """Density in proportion to (a² + s²)^(-3/2), with s along the line from where it comes closest to an axis. Its
+    integral is s / (a² √(a² + s²)), in units of a."""
+
+    closest: mi.Float
+    a: mi.Float
+    start: mi.Float
+    extent: mi.Float
+    total: mi.Float
+
+    def sample(self, u: mi.Float) -> mi.Float:
+        v = self.start + u * self.extent
+        return self.closest + self.a * v * dr.rsqrt(dr.maximum(1 - v * v, 1e-7))
+
+    def pdf(self, s: mi.Float) -> mi.Float:
+        x = (s - self.closest) / self.a
+        return _lobe(x * x) / (self.a * self.extent)
+
+
+def _on_line(slot: Slot, view: View, from_light: bool) -> tuple[_Wide, _Narrow]:
+    """Both densities on an edge, by length along it, with their weights."""
+    a, e = slot.a - view.p, slot.b - slot.a
+    length = dr.norm(e)
+    e /= length
+    foot = -dr.dot(a, e)
+    nearest = dr.maximum(dr.norm(a), dr.norm(a + e * length))
+    h = dr.maximum(dr.norm(a + foot * e), 1e-6 * nearest)
+    start = dr.atan2(-foot, h)
+    angle = dr.maximum(dr.atan2(length - foot, h) - start, 1e-7)
+    middle = dr.normalize(a + 0.5 * length * e)
+    # The cosine at the middle stands for all of the edge, and n may be that of the face, not of the shading.
+    margin = 0.02 if from_light else 0.05
+    cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(dr.dot(view.n, middle), 0, 1) + margin)
+    wide = _Wide(foot, h, start, angle, view.wide * cosine * angle)
+
+    across = lambda v: v - view.axis * dr.dot(view.axis, v)
+    a_across, e_across = across(a), across(e)
+    g2 = dr.maximum(dr.squared_norm(e_across), 1e-6)
+    closest = dr.clip(-dr.dot(a_across, e_across) / g2, 0, length)
+    c = a + closest * e
+    r2 = dr.squared_norm(c)
+    behind = dr.dot(view.axis, c) <= 0
+    off2 = dr.select(behind, r2, dr.squared_norm(a_across + closest * e_across))
+    A2 = dr.square(view.width) * r2
+    k = dr.sqrt((A2 + off2) / g2)
+    at = lambda s: (s - closest) / k * dr.rsqrt(1 + dr.square((s - closest) / k))
+    start = at(mi.Float(0))
+    extent = dr.maximum(at(length) - start, 1e-7)
+    total = view.peak * A2 * dr.sqrt(A2) / (g2 * dr.sqrt(g2) * k * k) * extent * h / r2
+    return wide, _Narrow(closest, k, start, extent, dr.select(dr.isfinite(total), total, 0))
+
+
+def _sample_point(slot: Slot, view: View, from_light: bool, choice: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Parameter t of a point on the edge, and its density."""
+    wide, narrow = _on_line(slot, view, from_light)
+    p = narrow.total / (wide.total + narrow.total)
+    p = dr.select(dr.isfinite(p), p, 0)
+    length = dr.norm(slot.b - slot.a)
+    s = dr.select(choice < p, narrow.sample(u), wide.sample(u))
+    s = dr.clip(s, 0, length)
+    return s / length, dr.lerp(wide.pdf(s), narrow.pdf(s), p) * length

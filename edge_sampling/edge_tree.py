@@ -1,0 +1,297 @@
+"""A bounding volume hierarchy over the edges of a scene, on the device: built once, refitted as vertices move.
+
+Every node says where its edges are (a box), how long they are together, and how their planes lie: a face plane is
+written q = (n, d), so that with y = (p, −1) the sign of q·y tells on which side a point p is. An edge is a silhouette
+as seen from p where its two planes differ in that sign. A node keeps a box around its planes, which rejects, and their
+first two moments, from which the expected number of silhouettes follows (`edge_importance.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .device_edges import COPLANAR, DeviceEdges
+from .edges import EdgeKind, Edges
+from .meshes import Geometry
+
+#: Edges of a leaf. They are tested one by one.
+LEAF = 8
+
+#: Planes whose signs are within this of zero, relative to the distance, count as edge-on.
+EDGE_ON = 1e-6
+
+
+@dataclass
+class Node:
+    """What is known of a set of edges; positions are relative to the centre of the tree.
+
+    silhouettes : length of the edges that may be silhouettes, scene units.
+    creases : length of the edges across which something jumps from wherever they are seen, weighted by how much.
+    lower, upper : box around them.
+    mean : of the planes of `silhouettes`, weighted by length.
+    variance : of the same: 10 numbers, the upper triangle of a symmetric matrix.
+    difference : second moment of the difference between the two planes of an edge, likewise.
+    plane_lower, plane_upper : box around the planes.
+    """
+
+    silhouettes: mi.Float
+    creases: mi.Float
+    lower: list[mi.Float]
+    upper: list[mi.Float]
+    mean: list[mi.Float]
+    variance: list[mi.Float]
+    difference: list[mi.Float]
+    plane_lower: list[mi.Float]
+    plane_upper: list[mi.Float]
+
+    def pack(self) -> list[mi.Vector4f]:
+        """In ten packets, as they are stored."""
+        numbers = [self.silhouettes, self.creases]
+        for field in fields(self)[2:]:
+            numbers += getattr(self, field.name)
+        return [mi.Vector4f(*numbers[i : i + 4]) for i in range(0, len(numbers), 4)]
+
+    @staticmethod
+    def unpack(packets: list[mi.Vector4f]) -> Node:
+        numbers = [x for packet in packets for x in packet]
+        parts, start = [], 2
+        for size in (3, 3, 4, 10, 10, 4, 4):
+            parts.append(numbers[start : start + size])
+            start += size
+        return Node(numbers[0], numbers[1], *parts)
+
+
+#: Packets of four numbers that make a `Node`, and an edge in a leaf.
+NODE_PACKETS, SLOT_PACKETS = 10, 4
+
+
+@dataclass
+class Slot:
+    """An edge in a leaf: end points relative to the centre of the tree, its two planes, and how much jumps across it
+    where it is no silhouette, from 0 (nothing) to 1."""
+
+    a: mi.Vector3f
+    b: mi.Vector3f
+    planes: tuple[mi.Vector4f, mi.Vector4f]
+    crease: mi.Float
+
+    def pack(self) -> list[mi.Vector4f]:
+        a, b = self.a, self.b
+        return [*self.planes, mi.Vector4f(a.x, a.y, a.z, self.crease), mi.Vector4f(b.x, b.y, b.z, 0)]
+
+    @staticmethod
+    def unpack(packets: list[mi.Vector4f]) -> Slot:
+        p, q, a, b = packets
+        return Slot(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(b.x, b.y, b.z), (p, q), a.w)
+
+
+class EdgeTree:
+    """Complete binary trees over groups of edges, one beside the other in flat arrays.
+
+    The order of the edges in the leaves is found once, by halving each node at the median along its longest side; it
+    stays good enough while a shape moves or deforms moderately. All else is computed from the vertex positions by
+    `refit`, level by level on the device.
+
+    Parameters
+    ----------
+    geometry : the meshes.
+    edges : their edges, on the host.
+    groups : indices into `edges`, a tree for each; without the empty ones.
+    radiance : do jumps of the reflected light count? If not, only those of the emitted light do, so that creases
+        between faces that do not emit are no boundaries.
+    """
+
+    def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray], radiance: bool):
+        self.geometry = geometry
+        self.device_edges = DeviceEdges(edges)
+        position = geometry.host_positions()
+        ends = position[edges.vertices[:, 0]]
+        centres = np.where(np.isfinite(ends), ends, 0).mean(1)
+        self.centre = mi.Point3f(*map(float, np.median(centres, axis=0)))
+        slots, self.depths = [], []
+        self.node_offsets, self.leaf_offsets = [0], [0]
+        for group in groups:
+            order = _order(centres[group])
+            slots.append(np.where(order < 0, -1, group[order]))
+            leaves = len(order)
+            self.depths.append(leaves.bit_length() - 1)
+            self.node_offsets.append(self.node_offsets[-1] + 2 * leaves)
+            self.leaf_offsets.append(self.leaf_offsets[-1] + leaves)
+        slot = np.concatenate(slots).reshape(-1)
+        self.slot_edge = mi.UInt32(np.maximum(slot, 0).astype(np.uint32))
+        self._used = mi.Bool(slot >= 0)
+        self._crease = mi.UInt32(_creases(geometry, edges, radiance)[np.maximum(slot, 0)])
+        self._any_split = radiance and bool((edges.kind == EdgeKind.SPLIT).any())
+        self.nodes = dr.zeros(mi.Float, self.node_offsets[-1] * NODE_PACKETS * 4)
+        self.slots = dr.zeros(mi.Float, self.leaf_offsets[-1] * LEAF * SLOT_PACKETS * 4)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the tree on the device, without the edges that it is over."""
+        return 4 * (dr.width(self.nodes) + dr.width(self.slots) + dr.width(self.slot_edge)) + 5 * dr.width(self._used)
+
+    # ---------------------- Access ----------------------
+
+    def node(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Node:
+        """Nodes by their number in all trees together. Of tree k, the root is number `node_offsets[k]` + 1; children
+        of its node i are 2i and 2i + 1."""
+        return Node.unpack(_gather(self.nodes, index, NODE_PACKETS, active))
+
+    def slot(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Slot:
+        return Slot.unpack(_gather(self.slots, index, SLOT_PACKETS, active))
+
+    # ---------------------- Refit ----------------------
+
+    def refit(self, positions: mi.Float) -> None:
+        """Follow the vertices to `positions`, (3 V,), world space; detached."""
+        with dr.suspend_grad():
+            slot = dr.arange(mi.UInt32, dr.width(self.slot_edge))
+            _scatter(self.slots, slot, self._slots_of(positions, slot).pack())
+            for depth, nodes, leaves in zip(self.depths, self.node_offsets, self.leaf_offsets, strict=False):
+                # Opaque offsets: all levels share one kernel.
+                first, offset = dr.opaque(mi.UInt32, 2**depth + nodes), dr.opaque(mi.UInt32, leaves * LEAF)
+                leaf = dr.arange(mi.UInt32, 2**depth)
+                _scatter(self.nodes, leaf + first, self._leaf(leaf * LEAF + offset).pack())
+                for level in reversed(range(depth)):
+                    first, offset = (dr.opaque(mi.UInt32, k * 2**level + nodes) for k in (1, 2))
+                    i = dr.arange(mi.UInt32, 2**level)
+                    pair = [Node.unpack(_gather(self.nodes, 2 * i + offset + k, NODE_PACKETS)) for k in (0, 1)]
+                    _scatter(self.nodes, i + first, _merge(*pair).pack())
+
+    def _slots_of(self, positions: mi.Float, slot: mi.UInt32) -> Slot:
+        device_edges = self.device_edges
+        edge = self.slot_edge
+        a, b = device_edges.end_points(positions, edge)
+        m = device_edges.normals(positions, edge)
+        lengths = [dr.norm(n) for n in m]
+        flat = [dr.select(l > 0, n / l, 0) for n, l in zip(m, lengths, strict=True)]
+        degenerate = (lengths[0] == 0) | (lengths[1] == 0)
+        planes = []
+        a, b = mi.Vector3f(a - self.centre), mi.Vector3f(b - self.centre)
+        for n in (flat[0], -flat[1]):
+            planes.append(mi.Vector4f(n.x, n.y, n.z, dr.dot(n, a)))
+        rule = self._crease
+        crease = dr.select(degenerate | (rule == _ALWAYS), 1, 0)
+        crease = dr.select(rule == _FOLD, dr.minimum(dr.norm(flat[0] + flat[1]), 1), crease)
+        if self._any_split:
+            split = device_edges.normals_differ(self.geometry.normals(), edge)
+            crease = dr.select(rule == _SPLIT, dr.minimum(split, 1), crease)
+        crease = dr.select(crease > COPLANAR, dr.maximum(crease, 0.02), 0)
+        # What is always a boundary has no planes, but signs that always differ.
+        for k, d in ((0, -1), (1, 1)):
+            planes[k] = dr.select(crease == 1, mi.Vector4f(0, 0, 0, d), planes[k])
+        usable = self._used & dr.isfinite(dr.squared_norm(a)) & dr.isfinite(dr.squared_norm(b))
+        a, b = dr.select(usable, a, 0), dr.select(usable, b, 0)
+        return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), dr.select(usable, crease, 0))
+
+    def _leaf(self, first: mi.UInt32) -> Node:
+        nodes = [self._single(self.slot(first + k)) for k in range(LEAF)]
+        while len(nodes) > 1:
+            nodes = [_merge(p, q) for p, q in zip(nodes[::2], nodes[1::2], strict=True)]
+        return nodes[0]
+
+    @staticmethod
+    def _single(s: Slot) -> Node:
+        length = dr.norm(s.b - s.a)
+        q, r = s.planes
+        Δ = q - r
+        difference = [Δ[i] * Δ[j] for i, j in _TRIANGLE]
+        used = length > 0
+        widest = lambda f, empty: [dr.select(used, f(x, y), empty) for x, y in zip(s.a, s.b, strict=True)]
+        # Wider than what the test of a single edge lets pass.
+        slack = 4 * EDGE_ON
+        always = dr.select(s.crease > 0, mi.Vector4f(0, 0, 0, 1), 0)
+        return Node(
+            length * (1 - s.crease),
+            length * s.crease,
+            widest(dr.minimum, dr.inf),
+            widest(dr.maximum, -dr.inf),
+            list(0.5 * (q + r)),
+            [x / 12 for x in difference],
+            difference,
+            list(dr.select(used, dr.minimum(dr.minimum(q, r), -always) - slack, dr.inf)),
+            list(dr.select(used, dr.maximum(dr.maximum(q, r), always) + slack, -dr.inf)),
+        )
+
+
+# ---------------------- Merging ----------------------
+
+_TRIANGLE = [(i, j) for i in range(4) for j in range(i, 4)]
+
+
+def _merge(p: Node, q: Node) -> Node:
+    total = p.silhouettes + q.silhouettes
+    w = dr.select(total > 0, q.silhouettes / total, 0)
+    blend = lambda x, y: [dr.lerp(s, t, w) for s, t in zip(x, y, strict=True)]
+    pairwise = lambda f, x, y: [f(s, t) for s, t in zip(x, y, strict=True)]
+    δ = [t - s for s, t in zip(p.mean, q.mean, strict=True)]
+    between = w * (1 - w)
+    variance = [v + between * δ[i] * δ[j] for v, (i, j) in zip(blend(p.variance, q.variance), _TRIANGLE, strict=True)]
+    return Node(
+        total,
+        p.creases + q.creases,
+        pairwise(dr.minimum, p.lower, q.lower),
+        pairwise(dr.maximum, p.upper, q.upper),
+        blend(p.mean, q.mean),
+        variance,
+        blend(p.difference, q.difference),
+        pairwise(dr.minimum, p.plane_lower, q.plane_lower),
+        pairwise(dr.maximum, p.plane_upper, q.plane_upper),
+    )
+
+
+def _gather(source: mi.Float, index: mi.UInt32, packets: int, active: mi.Bool | bool = True) -> list[mi.Vector4f]:
+    return [dr.gather(mi.Vector4f, source, index * packets + k, active) for k in range(packets)]
+
+
+def _scatter(target: mi.Float, index: mi.UInt32, packets: list[mi.Vector4f]) -> None:
+    for k, packet in enumerate(packets):
+        dr.scatter(target, packet, index * len(packets) + k)
+    dr.eval(target)
+
+
+# ---------------------- Order, and what jumps ----------------------
+
+
+def _order(centres: np.ndarray) -> np.ndarray:
+    """Edges of each leaf: (leaves, LEAF), indices into `centres`, -1 where there is none; `leaves` is a power of two."""
+    n = len(centres)
+    leaves = 1 << max(0, int(np.ceil(np.log2(n / LEAF))))
+    size = -(-n // leaves)
+    order = np.full(leaves * size, -1)
+    order[:n] = np.arange(n)
+    # What fills up sorts to the end.
+    padded = np.concatenate([centres, np.full((1, 3), np.nan)]).astype(np.float32)
+    width = leaves * size
+    while width > size:
+        order = order.reshape(-1, width)
+        c = padded[order]
+        with np.errstate(invalid="ignore"):
+            extent = np.fmax.reduce(c, axis=1) - np.fmin.reduce(c, axis=1)
+        axis = np.nan_to_num(extent, nan=-1.0).argmax(1)
+        key = np.take_along_axis(c, axis[:, None, None], axis=2)[..., 0]
+        order = np.take_along_axis(order, np.argpartition(key, width // 2, axis=1), axis=1)
+        width //= 2
+    order = order.reshape(leaves, size)
+    return np.concatenate([order, np.full((leaves, LEAF - size), -1)], axis=1)
+
+
+_NEVER, _ALWAYS, _FOLD, _SPLIT = range(4)
+
+
+def _creases(geometry: Geometry, edges: Edges, radiance: bool) -> np.ndarray:
+    """What makes each edge a boundary where it is no silhouette: (E,), uint32."""
+    rule = np.full(len(edges), _NEVER, np.uint32)
+    kind = edges.kind
+    if radiance:
+        rule[kind == EdgeKind.JUMP] = _ALWAYS
+        rule[kind == EdgeKind.FLAT] = _FOLD
+        rule[kind == EdgeKind.SPLIT] = _SPLIT
+    else:
+        emits = np.array([m.is_emitter() for m in geometry.meshes], bool)[edges.mesh].any(1)
+        rule[(kind == EdgeKind.JUMP) & (emits | (edges.count != 2))] = _ALWAYS
+    return rule

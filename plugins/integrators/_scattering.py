@@ -1,0 +1,188 @@
+"""Light that a surface scatters: direct illumination, and the next vertex of the path, attached to what moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.ad.integrators.common import mis_weight
+
+
+@dataclass
+class Next:
+    """The next vertex of a path, in the direction that was sampled from the BSDF.
+
+    ray, pi : the ray to it, and what that meets. Detached.
+    weight : throughput of *scattered* light, mi.Spectrum; attached where wanted. The vertex is held fixed in space.
+    η : relative index of refraction along the ray.
+    """
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    weight: mi.Spectrum
+    η: mi.Float
+
+
+class Scattering:
+    """Direct illumination by multiple importance sampling, and the next vertex of a path.
+
+    Of a light sample, the *material point* y is held fixed. With the solid angle written as area,
+    dω = |cos θ_y| dA(y) / r², its estimate is
+
+        f(ω) |cos θ_x| Lₑ(y, −ω) · |cos θ_y| dA / r²  /  p(ω),      ω = (y − x) / r,
+
+    where all factors but the density p follow the motion of x and y, dA by the change of the area of the triangle. For
+    scattered light, y is held fixed in space; the motion of its surface is felt where y scatters, since it is met by a
+    fixed ray. So the derivative at one vertex needs no other vertex to move (Worchel et al. 2025).
+
+    attached : carry gradients? Otherwise values only.
+    continues : is the next vertex wanted?
+    """
+
+    def __init__(self, scene: mi.Scene, *, attached: bool, continues: bool):
+        self.scene = scene
+        self.attached = attached
+        self.continues = continues
+        flags = [e.flags() for e in scene.emitters()]
+        self.any = bool(flags)
+        self.any_delta = any(f & mi.EmitterFlags.Delta for f in flags)
+        self.any_hit_by_rays = any(not f & mi.EmitterFlags.Delta for f in flags)
+        self.any_deforms = any(s.is_emitter() and s.parameters_grad_enabled() for s in scene.shapes())
+        # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
+        self.any_mirror = any(s.bsdf() is None or s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes())
+
+    def scatter(self, si, bsdf, sampler, active) -> tuple[mi.Spectrum, Next | None]:
+        """Direct illumination that `si` reflects, and the next vertex."""
+        from_emitter = self.sample_emitter(si, bsdf, sampler, active) if self.any else 0
+        from_bsdf, onwards = mi.Spectrum(0), None
+        if self.any_hit_by_rays or self.continues:
+            from_bsdf, onwards = self.sample_bsdf(si, bsdf, sampler, active)
+        with dr.resume_grad(when=self.attached):
+            return from_bsdf + from_emitter, onwards
+
+    def sample_emitter(self, si, bsdf, sampler, active):
+        """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,)."""
+        scene, context = self.scene, mi.BSDFContext()
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        sample = sampler.next_2d(active)
+        ds, weight = scene.sample_emitter_direction(si, sample, not self.attached, active)
+        active &= ds.pdf != 0
+        direction = ds.d
+        if self.attached:
+            direction, weight, visible = self._attach_emitter(si, ds, weight, sample, active)
+            active &= visible
+        with dr.resume_grad(when=self.attached):
+            f, pdf = bsdf.eval_pdf(context, si, si.to_local(direction), active)
+            mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(pdf)))
+            return dr.select(active, f * weight * mis, 0)
+
+    def _attach_emitter(self, si, ds, weight, sample, active):
+        """Direction and weight (Lₑ · geometry / density) of a light sample with their gradients, and its visibility."""
+        scene = self.scene
+        on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
+        # One ray answers both questions: is the light visible, and which of its triangles is y on?
+        ray = si.spawn_ray_to(ds.p)
+        before = mi.Float(ray.maxt)
+        ray.maxt = dr.select(on_surface, 2 * dr.norm(ds.p - ray.o) - ray.maxt, ray.maxt)
+        pi = scene.ray_intersect_preliminary(ray, active=active)
+        visible = dr.select(on_surface, pi.is_valid() & (pi.t >= before), ~pi.is_valid())
+        with dr.resume_grad():
+            y, ω, geometry = self._connect(si, pi, ray, on_surface & visible)
+            direction = dr.select(on_surface, ω, ds.d)
+            # Lights at infinity: the direction is fixed.
+            elsewhere = scene.eval_emitter_direction(si, ds, active & ~on_surface & ~ds.delta) / ds.pdf
+            attached = dr.select(
+                on_surface, y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf), elsewhere
+            )
+            if self.any_delta:
+                moved, at_delta = scene.sample_emitter_direction(si, sample, False, active & ds.delta)
+                direction = dr.select(ds.delta, moved.d, direction)
+                attached = dr.select(ds.delta, at_delta, attached)
+            return direction, dr.replace_grad(weight, attached), visible
+
+    def sample_bsdf(self, si, bsdf, sampler, active):
+        """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
+        vertex."""
+        scene, context = self.scene, mi.BSDFContext()
+        sample1, sample2 = sampler.next_1d(active), sampler.next_2d(active)
+        bs, weight = bsdf.sample(context, si, sample1, sample2, active)
+        active = active & dr.any(weight != 0)
+        mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        pi = scene.ray_intersect_preliminary(ray, active=active)
+        onwards = Next(ray, pi, mi.Spectrum(weight), bs.eta) if self.continues else None
+        if not self.attached:
+            y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        else:
+            with dr.resume_grad():
+                on_surface = active & pi.is_valid()
+                y, ω, geometry = self._connect(si, pi, ray, on_surface)
+                ω = dr.select(on_surface, ω, ray.d)
+                f = bsdf.eval(context, si, si.to_local(ω), active & ~mirrored)
+                attached = f * (dr.select(on_surface, geometry, 1) / bs.pdf)
+                if self.continues:
+                    d = dr.detach(y.p) - si.p
+                    ω = dr.normalize(d)
+                    g = dr.abs_dot(dr.detach(y.n), ω) / dr.squared_norm(d)
+                    f = bsdf.eval(context, si, si.to_local(ω), on_surface & ~mirrored)
+                    held = f * (g / (dr.detach(g) * bs.pdf))
+                if self.any_mirror:
+                    # A mirror turns its ray with it: what that meets slides over the light.
+                    turned, at_mirror = bsdf.sample(context, si, sample1, sample2, active & mirrored)
+                    onwards_turned = mi.Ray3f(ray)
+                    onwards_turned.o, onwards_turned.d = si.p, si.to_world(turned.wo)
+                    slid = pi.compute_surface_interaction(onwards_turned, mi.RayFlags.All, active & mirrored)
+                    y = dr.select(mirrored, slid, y)
+                    attached = dr.select(mirrored, at_mirror, attached)
+                    if self.continues:
+                        held = dr.select(mirrored, at_mirror, held)
+                if self.continues:
+                    onwards.weight = dr.replace_grad(weight, dr.select(active, held, 0))
+                weight = dr.replace_grad(weight, attached)
+        emitter = y.emitter(scene, active)
+        ds = mi.DirectionSample3f(scene, y, si)
+        pdf = scene.pdf_emitter_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
+        mis = dr.select(mirrored, 1, mis_weight(bs.pdf, pdf))
+        with dr.resume_grad(when=self.attached):
+            return dr.select(active, weight * emitter.eval(y, active) * mis, 0), onwards
+
+    def _connect(self, si, pi, ray, active):
+        """The material point y that `pi` stands for, the direction ω from `si` to it, and |cos θ_y| dA / r² relative
+        to its present value."""
+        y = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+        d = y.p - si.p
+        r2 = dr.squared_norm(d)
+        ω = d * dr.rsqrt(r2)
+        y.wi = dr.replace_grad(y.wi, y.to_local(-ω))
+        geometry = dr.abs_dot(y.n, ω) / r2
+        if self.any_deforms:
+            geometry *= self._area(pi, ray, active)
+        return y, ω, geometry / dr.detach(geometry)
+
+    def _area(self, pi, ray, active):
+        """Twice the area of the triangles hit, attached."""
+        corners = []
+        for u, v in ((0, 0), (1, 0), (0, 1)):
+            corner = mi.PreliminaryIntersection3f(pi)
+            corner.prim_uv = mi.Point2f(u, v)
+            flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
+            corners.append(corner.compute_surface_interaction(ray, flags, active).p)
+        return dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+
+
+def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
+    """Turn interpolated normals that face away from the viewer, on a face that does not, until they just face them.
+
+    Just inside of the silhouette of a smooth-shaded mesh such normals make a black fringe, whose inner border is a
+    jump that lies on no edge. The finer the mesh, the narrower the fringe: its two borders are taken together, as one
+    jump from the background to the surface beside it.
+    """
+    to_viewer = -ray.d
+    side = dr.sign(dr.dot(si.n, to_viewer))
+    cos = side * dr.dot(si.sh_frame.n, to_viewer)
+    ε = 1e-4
+    away = si.is_valid() & (cos < ε)
+    si.sh_frame.n = dr.select(away, dr.normalize(si.sh_frame.n + side * (ε - cos) * to_viewer), si.sh_frame.n)
+    si.initialize_sh_frame()
+    si.wi = dr.select(away, si.to_local(to_viewer), si.wi)
