@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -44,7 +44,8 @@ class Term:
     value : attached; only its gradient counts.
     weight : of each sample in the film's weight channel.
     per_pixel : how many neighbours in the wavefront belong to one pixel, 0 if they are in no order.
-    replay : propagates the gradient of the loss with respect to `value.L` to what `value` is not attached to.
+    replay : None, or what differentiates the part that `value` is not attached to. Backward: propagates the gradient
+        of the loss with respect to `value.L`. Forward: called with None, returns the derivative of `value.L`.
     """
 
     position: mi.Point2f
@@ -52,7 +53,10 @@ class Term:
     wavelengths: mi.Spectrum
     weight: float
     per_pixel: int
-    replay: Callable[[mi.Spectrum], Any] | None = None
+    replay: Callable[[mi.Spectrum | None], Any] | None = None
+
+    def detached(self) -> Term:
+        return replace(self, value=dr.detach(self.value))
 
 
 @dataclass(frozen=True)
@@ -96,20 +100,30 @@ class EdgeIntegrator(ADIntegrator):
         -------
         mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
         """
-        # A parameter that carries a gradient may well not show in the image: then the derivative is zero. None at all
-        # is a mistake.
-        free = dr.ADFlag.AllowNoGrad if params is not None and dr.grad_enabled(dict(params)) else dr.ADFlag(0)
+        if params is not None and not dr.grad_enabled(dict(params)):
+            raise RuntimeError(f"{self.name}: none of the parameters carries a gradient")
         with dr.suspend_grad():
-            film, terms = self._terms(scene, sensor, seed, spp, dr.ADMode.Forward)
-            with dr.resume_grad():
-                values = dr.forward_to([t.value for t in terms], flags=dr.ADFlag.Default | free)
+            film, makers = self._terms(scene, sensor, seed, spp, dr.ADMode.Forward)
+            terms, values = [], []
+            for make in makers:
+                # One term after the other: path replay needs that nothing else is attached to the parameters.
+                term = make()
+                with dr.resume_grad():
+                    # A parameter that carries a gradient may well not show in the image: then the derivative is zero.
+                    value = dr.forward_to(term.value, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+                term = term.detached()
+                if term.replay is not None:
+                    value.L += term.replay(None)
+                terms.append(term)
+                values.append(value)
             return self._develop(film, terms, values)
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the
         image, makes of them."""
         with dr.suspend_grad():
-            film, terms = self._terms(scene, sensor, seed, spp, dr.ADMode.Backward)
+            film, makers = self._terms(scene, sensor, seed, spp, dr.ADMode.Backward)
+            terms = [make() for make in makers]
             with dr.resume_grad():
                 # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
                 # is traced for it.
@@ -197,8 +211,8 @@ class EdgeIntegrator(ADIntegrator):
         L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=True)
         return L, dr.select(valid, mi.Float(1), 0)
 
-    def _from_points(self, scene, sampler, ray, shading: ShadingBoundary) -> mi.Spectrum:
-        """What edges do to the light that one vertex of each path reflects: mi.Spectrum, (N,), zero, with a gradient."""
+    def _seen_from_vertex(self, scene, sampler, ray, shading: ShadingBoundary) -> mi.Spectrum:
+        """What edges do to the light that a vertex of each path reflects: mi.Spectrum, (N,), zero, with a gradient."""
         pi = self._first_hit(scene, ray, True)
         first = Vertex(dr.detach(mi.Ray3f(ray)), pi, dr.full(mi.UInt32, 1, dr.width(pi.t)), mi.Spectrum(1), mi.Float(1))
         vertex, chosen, scattered = first, pi.is_valid(), None
@@ -228,59 +242,60 @@ class EdgeIntegrator(ADIntegrator):
 
     # ---------------------- Derivative image ----------------------
 
-    def _terms(self, scene, sensor, seed, spp, mode) -> tuple[mi.Film, list[Term]]:
-        """The samples of all terms of the derivative."""
+    def _terms(self, scene, sensor, seed, spp, mode) -> tuple[mi.Film, list[Callable[[], Term]]]:
+        """What makes the samples of each term of the derivative."""
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        film = sensor.film()
         sppc, sppp, sppi = (self._override(own, spp, sensor) for own in (self.sppc, self.sppp, self.sppi))
         boundaries = self._boundaries_of(scene, sensor, sppi)
-        terms = []
-
-        # ---------------------- Interior ----------------------
-
-        # Without interior samples, zeros still tell how much the filter weighs at each pixel.
+        # Without interior samples, zeros still tell how much the filter weighs at each pixel. There, the weights of the
+        # interior samples add up to `weights` times the integral of the filter. The film divides by that sum: so
+        # samples of boundaries, of weight zero, are normalised as the image is, for every filter.
         sampler, weights = self._sampler(sensor, seed, sppc or 16)
-        ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
-        L, _, _, replay = self.sample(mode, scene, sampler, ray) if sppc > 0 else (mi.Spectrum(0), None, None, None)
-        with dr.resume_grad():
-            if replay is not None and mode == dr.ADMode.Forward:
-                L += _with_gradient(replay(None))
-            adjoint = (lambda δ: replay(δ * dr.detach(ray_weight))) if replay is not None else None
-            terms.append(Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights, adjoint))
-
-        # At a pixel, the weights of the interior samples add up to `weights` times the integral of the filter. The
-        # film divides by that sum: so samples of boundaries, of weight zero, are normalised as the image is, for every
-        # filter.
-
-        # ---------------------- Film boundary ----------------------
-
+        terms = [lambda: self._interior(scene, sensor, sampler, weights, mode, sppc > 0)]
         if boundaries is not None and sppp > 0:
-            sampler, _ = self._sampler(sensor, 0xFFFFFFFF ^ seed, sppp)
-            s = boundaries.film.sample(
-                sensor, sampler, sampler.wavefront_size(), lambda *args: self._beside_edge(scene, *args)
-            )
-            with dr.resume_grad():
-                terms.append(Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0))
-
-        # ---------------------- Boundaries at shading points ----------------------
-
+            terms.append(lambda: self._film_boundary(scene, sensor, seed, sppp, weights, boundaries.film))
         shading = boundaries.shading if boundaries is not None and sppi > 0 else None
         if shading is not None:
             shading.refit()
-        if shading is not None and shading.from_lights_possible:
-            sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
-            s = shading.from_lights(scene, sensor, sampler, self._first_hit)
-            with dr.resume_grad():
-                terms.append(Term(s.position, Sample(s.value * weights, mi.Float(0)), s.wavelengths, 0.0, 0))
-        if shading is not None and (self.depths.scatters(2) or shading.emission_from_points):
-            sampler, sppi = self._sampler(sensor, 0x55555555 ^ seed, sppi)
-            ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
-            L = self._from_points(scene, sampler, ray, shading)
-            with dr.resume_grad():
-                L *= ray_weight * (weights / sppi)
-                terms.append(Term(position, Sample(L, mi.Float(0)), ray.wavelengths, 0.0, sppi))
-        return film, terms
+            if shading.from_lights_possible:
+                terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, shading))
+            if self.depths.scatters(2) or shading.emission_from_points:
+                terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, shading))
+        return sensor.film(), terms
+
+    def _interior(self, scene, sensor, sampler, weights, mode, wanted: bool) -> Term:
+        ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
+        if not wanted:
+            return Term(position, Sample(mi.Spectrum(0), mi.Float(0)), ray.wavelengths, 1.0, weights)
+        L, _, _, replay = self.sample(mode, scene, sampler, ray)
+        w, rest = dr.detach(ray_weight), None
+        if replay is not None:
+            rest = lambda δ: w * replay(None) if δ is None else replay(δ * w)
+        with dr.resume_grad():
+            return Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights, rest)
+
+    def _film_boundary(self, scene, sensor, seed, sppp, weights, boundary: FilmBoundary) -> Term:
+        """Visibility as seen from the sensor."""
+        sampler, _ = self._sampler(sensor, 0xFFFFFFFF ^ seed, sppp)
+        s = boundary.sample(sensor, sampler, sampler.wavefront_size(), lambda *args: self._beside_edge(scene, *args))
+        with dr.resume_grad():
+            return Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0)
+
+    def _shadows(self, scene, sensor, seed, sppi, weights, shading: ShadingBoundary) -> Term:
+        """Shadows at the first vertex, found from the lights."""
+        sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
+        s = shading.from_lights(scene, sensor, sampler, self._first_hit)
+        with dr.resume_grad():
+            return Term(s.position, Sample(s.value * weights, mi.Float(0)), s.wavelengths, 0.0, 0)
+
+    def _from_points(self, scene, sensor, seed, sppi, weights, shading: ShadingBoundary) -> Term:
+        """Boundaries as seen from one vertex of each path."""
+        sampler, sppi = self._sampler(sensor, 0x55555555 ^ seed, sppi)
+        ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
+        L = self._seen_from_vertex(scene, sampler, ray, shading)
+        with dr.resume_grad():
+            return Term(position, Sample(L * ray_weight * (weights / sppi), mi.Float(0)), ray.wavelengths, 0.0, sppi)
 
     @staticmethod
     def _develop(film: mi.Film, terms: list[Term], values: list[Sample]) -> mi.TensorXf:
@@ -394,11 +409,3 @@ class EdgeIntegrator(ADIntegrator):
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, count)
         return sampler, spp
-
-
-def _with_gradient(tangent: mi.Spectrum) -> mi.Spectrum:
-    """Zero, with the gradient `tangent`."""
-    x = dr.zeros(mi.Spectrum, dr.width(tangent))
-    dr.enable_grad(x)
-    dr.set_grad(x, tangent)
-    return x

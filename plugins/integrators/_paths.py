@@ -94,7 +94,7 @@ def replay(
             rest = dr.select(dr.detach(weight) != 0, L * weight / dr.detach(weight), 0)
             Lo = dr.select(active, vertex.β * direct + rest, 0)
             if δL is None:
-                tangent += dr.forward_to(Lo, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+                tangent += dr.forward_to(Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
             else:
                 dr.backward_from(δL * Lo)
         vertex, active = _step(vertex, onwards, sampler, depths, active)
