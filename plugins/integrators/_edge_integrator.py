@@ -133,13 +133,14 @@ class EdgeIntegrator(ADIntegrator):
                 dr.set_grad(image, grad_in)
                 dr.enqueue(dr.ADMode.Backward, image)
                 dr.traverse(dr.ADMode.Backward)
-                for term, value in zip(terms, values, strict=True):
-                    dr.set_grad(term.value, dr.grad(value))
+                gradients = [dr.grad(value) for value in values]
+                for term, gradient in zip(terms, gradients, strict=True):
+                    dr.set_grad(term.value, gradient)
                     dr.enqueue(dr.ADMode.Backward, term.value)
                 dr.traverse(dr.ADMode.Backward)
-            for term, value in zip(terms, values, strict=True):
+            for term, gradient in zip(terms, gradients, strict=True):
                 if term.replay is not None:
-                    term.replay(dr.grad(value.L))
+                    term.replay(gradient.L)
             dr.eval()
 
     # ---------------------- Radiance ----------------------
