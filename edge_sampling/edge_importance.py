@@ -147,7 +147,7 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
     # Planes are not normally distributed: this falls off like the exponential at first, but has a heavier tail.
     tail = dr.rcp(dr.square(dr.square(1 + 0.125 * mean * mean / variance)))
     silhouettes = dr.minimum(dr.sqrt(difference / variance) * dr.inv_pi * tail, 1)
-    length = node.creases + node.silhouettes * (silhouettes + FLOOR)
+    length = node.always + node.silhouettes * (silhouettes + FLOOR)
 
     lower, upper = mi.Vector3f(node.lower), mi.Vector3f(node.upper)
     half = 0.5 * (upper - lower)
@@ -173,10 +173,8 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     signs = [dr.dot(q, y) for q in slot.planes]
     edge_on = EDGE_ON * dr.norm(slot.a - view.p)
     silhouette = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
-    # Faces that both turn away are usually hidden by others.
-    crease = dr.select((signs[0] < 0) & (signs[1] < 0), 0.1, 1) * slot.crease
     wide, narrow = _on_line(slot, view, from_light)
-    result = dr.select(silhouette, 1, crease) * (wide.total + narrow.total)
+    result = dr.select(silhouette, wide.total + narrow.total, 0)
     if from_light:
         result *= dr.rsqrt(dr.squared_norm(0.5 * (slot.a + slot.b) - view.p) + dr.squared_norm(slot.b - slot.a) / 12)
     ends = [dr.dot(view.n, v - view.p) > EDGE_ON * dr.norm(v - view.p) for v in (slot.a, slot.b)]

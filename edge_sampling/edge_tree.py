@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .device_edges import COPLANAR, DeviceEdges
-from .edges import EdgeKind, Edges
+from .device_edges import DeviceEdges
+from .edges import Edges
 from .meshes import Geometry
 
 #: Edges of a leaf. They are tested one by one.
@@ -30,7 +30,8 @@ class Node:
     """What is known of a set of edges; positions are relative to the centre of the tree.
 
     silhouettes : length of the edges that may be silhouettes, scene units.
-    creases : length of the edges across which something jumps from wherever they are seen, weighted by how much.
+    always : length of the edges that are boundaries from wherever they are seen: open ones, and where more than two
+        faces meet.
     lower, upper : box around them.
     mean : of the planes of `silhouettes`, weighted by length.
     variance : of the same: 10 numbers, the upper triangle of a symmetric matrix.
@@ -39,7 +40,7 @@ class Node:
     """
 
     silhouettes: mi.Float
-    creases: mi.Float
+    always: mi.Float
     lower: list[mi.Float]
     upper: list[mi.Float]
     mean: list[mi.Float]
@@ -50,7 +51,7 @@ class Node:
 
     def pack(self) -> list[mi.Vector4f]:
         """In ten packets, as they are stored."""
-        numbers = [self.silhouettes, self.creases]
+        numbers = [self.silhouettes, self.always]
         for field in fields(self)[2:]:
             numbers += getattr(self, field.name)
         return [mi.Vector4f(*numbers[i : i + 4]) for i in range(0, len(numbers), 4)]
@@ -71,17 +72,17 @@ NODE_PACKETS, SLOT_PACKETS = 10, 4
 
 @dataclass
 class Slot:
-    """An edge in a leaf: end points relative to the centre of the tree, its two planes, and how much jumps across it
-    where it is no silhouette, from 0 (nothing) to 1."""
+    """An edge in a leaf: end points relative to the centre of the tree, its two planes, and 1 if it is always a
+    boundary, 0 if as a silhouette only."""
 
     a: mi.Vector3f
     b: mi.Vector3f
     planes: tuple[mi.Vector4f, mi.Vector4f]
-    crease: mi.Float
+    always: mi.Float
 
     def pack(self) -> list[mi.Vector4f]:
         a, b = self.a, self.b
-        return [*self.planes, mi.Vector4f(a.x, a.y, a.z, self.crease), mi.Vector4f(b.x, b.y, b.z, 0)]
+        return [*self.planes, mi.Vector4f(a.x, a.y, a.z, self.always), mi.Vector4f(b.x, b.y, b.z, 0)]
 
     @staticmethod
     def unpack(packets: list[mi.Vector4f]) -> Slot:
@@ -101,11 +102,9 @@ class EdgeTree:
     geometry : the meshes.
     edges : their edges, on the host.
     groups : indices into `edges`, a tree for each; without the empty ones.
-    radiance : do jumps of the reflected light count? If not, only those of the emitted light do, so that creases
-        between faces that do not emit are no boundaries.
     """
 
-    def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray], radiance: bool):
+    def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray]):
         self.geometry = geometry
         self.device_edges = DeviceEdges(edges)
         position = geometry.host_positions()
@@ -124,8 +123,7 @@ class EdgeTree:
         slot = np.concatenate(slots).reshape(-1)
         self.slot_edge = mi.UInt32(np.maximum(slot, 0).astype(np.uint32))
         self._used = mi.Bool(slot >= 0)
-        self._crease = mi.UInt32(_creases(geometry, edges, radiance)[np.maximum(slot, 0)])
-        self._any_split = radiance and bool((edges.kind == EdgeKind.SPLIT).any())
+        self._open = mi.Bool(edges.count[np.maximum(slot, 0)] != 2)
         self.nodes = dr.zeros(mi.Float, self.node_offsets[-1] * NODE_PACKETS * 4)
         self.slots = dr.zeros(mi.Float, self.leaf_offsets[-1] * LEAF * SLOT_PACKETS * 4)
 
@@ -168,25 +166,18 @@ class EdgeTree:
         a, b = device_edges.end_points(positions, edge)
         m = device_edges.normals(positions, edge)
         lengths = [dr.norm(n) for n in m]
-        flat = [dr.select(l > 0, n / l, 0) for n, l in zip(m, lengths, strict=True)]
-        degenerate = (lengths[0] == 0) | (lengths[1] == 0)
+        flat = [dr.select(length > 0, n / length, 0) for n, length in zip(m, lengths, strict=True)]
         planes = []
         a, b = mi.Vector3f(a - self.centre), mi.Vector3f(b - self.centre)
         for n in (flat[0], -flat[1]):
             planes.append(mi.Vector4f(n.x, n.y, n.z, dr.dot(n, a)))
-        rule = self._crease
-        crease = dr.select(degenerate | (rule == _ALWAYS), 1, 0)
-        crease = dr.select(rule == _FOLD, dr.minimum(dr.norm(flat[0] + flat[1]), 1), crease)
-        if self._any_split:
-            split = device_edges.normals_differ(self.geometry.normals(), edge)
-            crease = dr.select(rule == _SPLIT, dr.minimum(split, 1), crease)
-        crease = dr.select(crease > COPLANAR, dr.maximum(crease, 0.02), 0)
+        always = self._open | (lengths[0] == 0) | (lengths[1] == 0)
         # What is always a boundary has no planes, but signs that always differ.
         for k, d in ((0, -1), (1, 1)):
-            planes[k] = dr.select(crease == 1, mi.Vector4f(0, 0, 0, d), planes[k])
+            planes[k] = dr.select(always, mi.Vector4f(0, 0, 0, d), planes[k])
         usable = self._used & dr.isfinite(dr.squared_norm(a)) & dr.isfinite(dr.squared_norm(b))
         a, b = dr.select(usable, a, 0), dr.select(usable, b, 0)
-        return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), dr.select(usable, crease, 0))
+        return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), mi.Float(always & usable))
 
     def _leaf(self, first: mi.UInt32) -> Node:
         nodes = [self._single(self.slot(first + k)) for k in range(LEAF)]
@@ -204,17 +195,16 @@ class EdgeTree:
         widest = lambda f, empty: [dr.select(used, f(x, y), empty) for x, y in zip(s.a, s.b, strict=True)]
         # Wider than what the test of a single edge lets pass.
         slack = 4 * EDGE_ON
-        always = dr.select(s.crease > 0, mi.Vector4f(0, 0, 0, 1), 0)
         return Node(
-            length * (1 - s.crease),
-            length * s.crease,
+            length * (1 - s.always),
+            length * s.always,
             widest(dr.minimum, dr.inf),
             widest(dr.maximum, -dr.inf),
             list(0.5 * (q + r)),
             [x / 12 for x in difference],
             difference,
-            list(dr.select(used, dr.minimum(dr.minimum(q, r), -always) - slack, dr.inf)),
-            list(dr.select(used, dr.maximum(dr.maximum(q, r), always) + slack, -dr.inf)),
+            list(dr.select(used, dr.minimum(q, r) - slack, dr.inf)),
+            list(dr.select(used, dr.maximum(q, r) + slack, -dr.inf)),
         )
 
 
@@ -233,7 +223,7 @@ def _merge(p: Node, q: Node) -> Node:
     variance = [v + between * δ[i] * δ[j] for v, (i, j) in zip(blend(p.variance, q.variance), _TRIANGLE, strict=True)]
     return Node(
         total,
-        p.creases + q.creases,
+        p.always + q.always,
         pairwise(dr.minimum, p.lower, q.lower),
         pairwise(dr.maximum, p.upper, q.upper),
         blend(p.mean, q.mean),
@@ -254,11 +244,11 @@ def _scatter(target: mi.Float, index: mi.UInt32, packets: list[mi.Vector4f]) -> 
     dr.eval(target)
 
 
-# ---------------------- Order, and what jumps ----------------------
+# ---------------------- Order ----------------------
 
 
 def _order(centres: np.ndarray) -> np.ndarray:
-    """Edges of each leaf: (leaves, LEAF), indices into `centres`, -1 where there is none; `leaves` is a power of two."""
+    """Edges of each leaf: (leaves, LEAF), indices into `centres`, -1 for none; `leaves` is a power of two."""
     n = len(centres)
     leaves = 1 << max(0, int(np.ceil(np.log2(n / LEAF))))
     size = -(-n // leaves)
@@ -278,20 +268,3 @@ def _order(centres: np.ndarray) -> np.ndarray:
         width //= 2
     order = order.reshape(leaves, size)
     return np.concatenate([order, np.full((leaves, LEAF - size), -1)], axis=1)
-
-
-_NEVER, _ALWAYS, _FOLD, _SPLIT = range(4)
-
-
-def _creases(geometry: Geometry, edges: Edges, radiance: bool) -> np.ndarray:
-    """What makes each edge a boundary where it is no silhouette: (E,), uint32."""
-    rule = np.full(len(edges), _NEVER, np.uint32)
-    kind = edges.kind
-    if radiance:
-        rule[kind == EdgeKind.JUMP] = _ALWAYS
-        rule[kind == EdgeKind.FLAT] = _FOLD
-        rule[kind == EdgeKind.SPLIT] = _SPLIT
-    else:
-        emits = np.array([m.is_emitter() for m in geometry.meshes], bool)[edges.mesh].any(1)
-        rule[(kind == EdgeKind.JUMP) & (emits | (edges.count != 2))] = _ALWAYS
-    return rule

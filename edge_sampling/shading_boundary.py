@@ -6,9 +6,10 @@ derivative of L gains
 
     ∮ f |cos θ| · Σ_sides ± L_side · n · (ω̇_edge − ω̇_side) dl,        n dl = (ω × dω/dt) dt = (ω × e′(t)) / r dt
 
-with ω = (e(t) − x) / r. ω̇_side is what the interior derivative holds fixed on that side. For emitted light, this is the
-*material point* that emits. So neither an emitter nor the face beside the edge contributes by its own motion, only what
-is seen past the edge. For scattered light it is the point *in space* that scatters, as seen from a moving x.
+with ω = (e(t) − x) / r. ω̇_side is the velocity of what the interior derivative holds fixed on that side: the *material
+point* that is seen there. A face that ends at the edge moves as the edge does, and contributes nothing: so neither do
+creases, nor the outlines of lights by their own motion. What is left is what is seen past a silhouette, on the side
+where its faces are not.
 
 Edges are found in two ways. *From points*: at a shading point of a path, by a descent of the edge tree. *From lights*:
 from a point on a light, by the same descent; the shading point is then where the shadow of the edge falls, if the
@@ -62,7 +63,6 @@ class ShadingBoundary:
     moving : for every mesh, does it move?
     everything : do all edges matter at all points, since the camera or a light moves? Otherwise at points that stand
         still only moving edges do.
-    radiance : does scattered light count, or only emitted light?
     """
 
     def __init__(
@@ -73,14 +73,13 @@ class ShadingBoundary:
         moving: tuple[bool, ...],
         *,
         everything: bool,
-        radiance: bool,
     ):
         self.geometry = geometry
         self.moving_meshes = [m for m, moves in zip(geometry.meshes, moving, strict=True) if moves]
         self.everything = everything
         moves = np.array(moving)[edges.mesh].any(axis=1) if not everything else np.ones(len(edges), bool)
         self.groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
-        self.tree = EdgeTree(geometry, edges, self.groups, radiance)
+        self.tree = EdgeTree(geometry, edges, self.groups)
         emitters = scene.emitters()
         surface = [i for i, e in enumerate(emitters) if e.flags() & mi.EmitterFlags.Surface]
         self.surface_lights = mi.UInt32(surface)
@@ -268,43 +267,31 @@ class ShadingBoundary:
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
             active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
-            # Emitted light jumps only beside the faces of the edge.
-            sides = [mi.Float(-1), mi.Float(1)]
-            if scattered is None:
-                sides = [edges.outward(positions, sample.edge, p, across)]
-                active &= sides[0] != 0
-            offset = _offset(p, x) * across
+            side = edges.outward(positions, sample.edge, p, across)
+            active &= side != 0
             n_dl = dr.select(active, n_dl, 0)
+            # Mitsuba lifts the origin off the surface by more than the offset: aim from there.
+            ray = si.spawn_ray_to(p + side * _offset(p, x) * across)
+            ray.maxt = dr.largest(mi.Float)
+            pi = scene.ray_intersect_preliminary(ray, active=active)
+            y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            emitter = y.emitter(scene, active)
+            lit = active & emission & (emitter != None)  # noqa: E711 (an array of pointers)
+            if target is not None:
+                lit &= (emitter == target[0]) & (dr.abs(pi.t - distance - target[1]) <= 1e-3 * pi.t)
+            on_surface = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+            light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), on_surface)
+            L = emitter.eval(y, lit) * dr.select(on_surface, emission_weight(light_pdf, pdf), 1)
+            valid = active & y.is_valid()
+            if scattered is not None:
+                L += dr.select(valid, scattered(ray, pi, sampler, valid), 0)
+            L = dr.select(active, f * L, 0)
 
         with dr.resume_grad():
             a, b = edges.end_points(positions, sample.edge)
-            edge_velocity = _turning(n_dl, dr.lerp(a, b, sample.t) - si.p, active)
-            result = mi.Spectrum(0)
-            for side in sides:
-                with dr.suspend_grad():
-                    # Mitsuba lifts the origin off the surface by more than the offset: aim from there.
-                    ray = si.spawn_ray_to(p + side * offset)
-                    ray.maxt = dr.largest(mi.Float)
-                    pi = scene.ray_intersect_preliminary(ray, active=active)
-                y = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-                with dr.suspend_grad():
-                    emitter = y.emitter(scene, active)
-                    lit = active & (emitter != None)  # noqa: E711 (an array of pointers)
-                    if target is not None:
-                        lit &= (emitter == target[0]) & (dr.abs(pi.t - distance - target[1]) <= 1e-3 * pi.t)
-                    Le = emitter.eval(y, lit & emission)
-                    on_surface = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-                    light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), on_surface)
-                    Le *= dr.select(on_surface, emission_weight(light_pdf, pdf), 1)
-                    Le = dr.select(lit & emission, f * Le, 0)
-                valid = active & y.is_valid()
-                held = dr.select(valid, y.p, p)
-                result -= side * Le * (edge_velocity - _turning(n_dl, held - si.p, valid))
-                if scattered is not None:
-                    with dr.suspend_grad():
-                        Ls = dr.select(valid, f * scattered(ray, pi, sampler.clone(), valid), 0)
-                    result -= side * Ls * (edge_velocity - _turning(n_dl, dr.detach(held) - si.p, valid))
-        return result
+            y = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, valid).p
+            velocity = _turning(n_dl, dr.lerp(a, b, sample.t) - si.p, active) - _turning(n_dl, y - si.p, valid)
+            return -side * L * velocity
 
 
 def _share(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -320,6 +307,6 @@ def _turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:
 
 
 def _offset(p: mi.Point3f, q: mi.Point3f) -> mi.Float:
-    """How far beside an edge at p to look from q, or from p itself: just beyond what single precision can tell apart."""
+    """How far beside an edge at p to look, from q or from p: just beyond what single precision can tell apart."""
     scale = dr.max(dr.maximum(dr.abs(mi.Vector3f(p)), dr.abs(mi.Vector3f(q))))
     return 32 * dr.epsilon(mi.Float) * scale + 1e-5 * dr.norm(p - q)

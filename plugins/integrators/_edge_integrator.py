@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +19,7 @@ from rimlight.edge_sampling import (
     jumping_textures,
 )
 
-from ._paths import Depths, Vertex, choose_vertex, replay, scattered_light
+from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, up_to_horizon
 
 HARD_SHADOWS = (
@@ -44,8 +43,8 @@ class Term:
     value : attached; only its gradient counts.
     weight : of each sample in the film's weight channel.
     per_pixel : how many neighbours in the wavefront belong to one pixel, 0 if they are in no order.
-    replay : None, or what differentiates the part that `value` is not attached to. Backward: propagates the gradient
-        of the loss with respect to `value.L`. Forward: called with None, returns the derivative of `value.L`.
+    replay : None, or what differentiates the part of the path that `value` is not attached to.
+    throughput : of the camera ray, which weighs that part.
     """
 
     position: mi.Point2f
@@ -53,7 +52,8 @@ class Term:
     wavelengths: mi.Spectrum
     weight: float
     per_pixel: int
-    replay: Callable[[mi.Spectrum | None], Any] | None = None
+    replay: Replay | None = None
+    throughput: mi.Spectrum | None = None
 
     def detached(self) -> Term:
         return replace(self, value=dr.detach(self.value))
@@ -110,10 +110,13 @@ class EdgeIntegrator(ADIntegrator):
                 term = make()
                 with dr.resume_grad():
                     # A parameter that carries a gradient may well not show in the image: then the derivative is zero.
-                    value = dr.forward_to(term.value, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+                    first = term.replay.first if term.replay is not None else mi.Point3f(0)
+                    value, first = dr.forward_to(
+                        [term.value, first], flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+                    )
                 term = term.detached()
                 if term.replay is not None:
-                    value.L += term.replay(None)
+                    value.L += term.throughput * term.replay.forward(first)
                 terms.append(term)
                 values.append(value)
             return self._develop(film, terms, values)
@@ -133,14 +136,17 @@ class EdgeIntegrator(ADIntegrator):
                 dr.set_grad(image, grad_in)
                 dr.enqueue(dr.ADMode.Backward, image)
                 dr.traverse(dr.ADMode.Backward)
-                gradients = [dr.grad(value) for value in values]
-                for term, gradient in zip(terms, gradients, strict=True):
+                for term, value in zip(terms, values, strict=True):
+                    gradient = dr.grad(value)
+                    if term.replay is not None:
+                        with dr.suspend_grad():
+                            first = term.replay.backward(gradient.L * term.throughput)
+                        if first is not None:
+                            dr.set_grad(term.replay.first, first)
+                            dr.enqueue(dr.ADMode.Backward, term.replay.first)
                     dr.set_grad(term.value, gradient)
                     dr.enqueue(dr.ADMode.Backward, term.value)
                 dr.traverse(dr.ADMode.Backward)
-            for term, gradient in zip(terms, gradients, strict=True):
-                if term.replay is not None:
-                    term.replay(gradient.L)
             dr.eval()
 
     # ---------------------- Radiance ----------------------
@@ -156,8 +162,7 @@ class EdgeIntegrator(ADIntegrator):
         L : mi.Spectrum, (N,); unless `mode` is primal, attached to the first vertex of its path.
         valid : mi.Bool, (N,); does the ray meet a surface, or a visible environment? The alpha channel.
         aovs : empty; Mitsuba's interface has them.
-        replay : None, or what differentiates the rest of the path: called with the gradient of the loss with respect
-            to L, or in forward mode with None, when it returns the derivative.
+        replay : None, or what differentiates the rest of the path.
         """
         attached = mode != dr.ADMode.Primal
         active = mi.Bool(active)
@@ -183,21 +188,25 @@ class EdgeIntegrator(ADIntegrator):
 
         # ---------------------- Light that it scatters ----------------------
 
-        scattering = Scattering(scene, attached=attached, continues=self.depths.scatters(2))
-        direct, onwards = scattering.scatter(si, bsdf, sampler, active)
+        direct, onwards = Scattering(scene, attached=attached).scatter(si, bsdf, sampler, active)
         with dr.resume_grad(when=attached):
             L += direct
-        if onwards is not None:
-            one = dr.full(mi.UInt32, 2, dr.width(L))
+        if self.depths.scatters(2):
+            first = self._camera_vertex(ray, pi)
             β = dr.select(active, dr.detach(onwards.weight), 0)
-            second = Vertex(mi.Ray3f(onwards.ray), onwards.pi, one, β, mi.Float(onwards.η))
+            second = Vertex(mi.Ray3f(onwards.ray), onwards.pi, first.depth + 1, β, mi.Float(onwards.η))
             again = sampler.clone() if attached else None
             indirect = scattered_light(scene, sampler, second, self.depths, active)
             with dr.resume_grad(when=attached):
                 L += dr.select(β != 0, indirect * onwards.weight / β, 0)
             if attached:
-                rest = lambda δL: replay(scene, again, second, self.depths, active, indirect, δL)
+                rest = Replay(scene, again, first, second, self.depths, active, si.p, indirect)
         return L, valid, [], rest
+
+    @staticmethod
+    def _camera_vertex(ray, pi) -> Vertex:
+        one = dr.full(mi.UInt32, 1, dr.width(pi.t))
+        return Vertex(dr.detach(mi.Ray3f(ray)), pi, one, dr.full(mi.Spectrum, 1, dr.width(one)), mi.Float(1))
 
     def _first_hit(self, scene, ray, active):
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -215,15 +224,18 @@ class EdgeIntegrator(ADIntegrator):
     def _seen_from_vertex(self, scene, sampler, ray, shading: ShadingBoundary) -> mi.Spectrum:
         """What edges do to the light that a vertex of each path reflects: mi.Spectrum, (N,), zero, with a gradient."""
         pi = self._first_hit(scene, ray, True)
-        first = Vertex(dr.detach(mi.Ray3f(ray)), pi, dr.full(mi.UInt32, 1, dr.width(pi.t)), mi.Spectrum(1), mi.Float(1))
+        first = self._camera_vertex(ray, pi)
         vertex, chosen, scattered = first, pi.is_valid(), None
         if self.depths.scatters(2):
             vertex, chosen = choose_vertex(scene, sampler, first, self.depths, chosen)
             scattered = lambda ray, pi, sampler, active: self._onwards(scene, vertex, ray, pi, sampler, active)
         at_first = vertex.depth == 1
         with dr.resume_grad():
-            own_ray = dr.select(at_first, mi.Ray3f(ray), vertex.ray)
-            si = vertex.pi.compute_surface_interaction(own_ray, mi.RayFlags.All, chosen)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, at_first)
+            if self.depths.scatters(2):
+                # Vertices farther on follow their surfaces.
+                follow = mi.RayFlags.All | mi.RayFlags.FollowShape
+                si = dr.select(at_first, si, vertex.pi.compute_surface_interaction(vertex.ray, follow, chosen))
         L = shading.from_points(
             scene,
             si,
@@ -270,11 +282,9 @@ class EdgeIntegrator(ADIntegrator):
         if not wanted:
             return Term(position, Sample(mi.Spectrum(0), mi.Float(0)), ray.wavelengths, 1.0, weights)
         L, _, _, replay = self.sample(mode, scene, sampler, ray)
-        w, rest = dr.detach(ray_weight), None
-        if replay is not None:
-            rest = lambda δ: w * replay(None) if δ is None else replay(δ * w)
         with dr.resume_grad():
-            return Term(position, Sample(L * ray_weight, mi.Float(0)), ray.wavelengths, 1.0, weights, rest)
+            value = Sample(L * ray_weight, mi.Float(0))
+        return Term(position, value, ray.wavelengths, 1.0, weights, replay, dr.detach(ray_weight))
 
     def _film_boundary(self, scene, sensor, seed, sppp, weights, boundary: FilmBoundary) -> Term:
         """Visibility as seen from the sensor."""
@@ -359,7 +369,6 @@ class EdgeIntegrator(ADIntegrator):
             self._edges,
             moving,
             everything=camera_moves or lights_move,
-            radiance=bool(self.depths.scatters(2)),
         )
 
     def _warn_of_limits(self, scene, sppi) -> None:

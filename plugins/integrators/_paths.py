@@ -44,7 +44,7 @@ def scattered_light(
     scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, depths: Depths, active: mi.Bool
 ) -> mi.Spectrum:
     """Light that arrives by way of `vertex`, without what it emits: mi.Spectrum, (N,), detached; times its β."""
-    scattering = Scattering(scene, attached=False, continues=True)
+    scattering = Scattering(scene, attached=False)
 
     def bounce(L, vertex, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
@@ -60,61 +60,97 @@ def scattered_light(
     ]
 
 
-def replay(
-    scene: mi.Scene,
-    sampler: mi.Sampler,
-    vertex: Vertex,
-    depths: Depths,
-    active: mi.Bool,
-    L: mi.Spectrum,
-    δL: mi.Spectrum | None,
-) -> mi.Spectrum:
-    """Derivative of `scattered_light` at its fixed samples, by path replay (Vicini et al. 2021).
+class Replay:
+    """Derivative of `scattered_light` at its fixed samples, by path replay (Vicini et al. 2021). All vertices follow
+    their surfaces, but for the first, which the camera sees.
 
     sampler : in the state in which `scattered_light` found it.
-    L : what that returned.
-    δL : gradient of the loss with respect to it: it is propagated to the parameters. None: forward mode.
-
-    Returns
-    -------
-    In forward mode, the derivative of `scattered_light`: mi.Spectrum, (N,), detached.
+    before, vertex : the first two of the path.
+    first : mi.Point3f, position of the first; attached.
+    L : what `scattered_light` returned.
     """
-    scattering = Scattering(scene, attached=True, continues=True)
 
-    def bounce(L, tangent, vertex, active, sampler):
-        with dr.resume_grad():
-            # A fixed ray meets the surface, wherever that moves.
-            si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
-        bsdf = si.bsdf(vertex.ray)
-        direct, onwards = scattering.scatter(si, bsdf, sampler, active)
-        L -= dr.select(active, vertex.β * dr.detach(direct), 0)
-        with dr.resume_grad():
-            # What comes from farther on, relative to its value.
-            weight = onwards.weight
-            rest = dr.select(dr.detach(weight) != 0, L * weight / dr.detach(weight), 0)
-            Lo = dr.select(active, vertex.β * direct + rest, 0)
-            if δL is None:
-                tangent += dr.forward_to(Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
-            else:
-                dr.backward_from(δL * Lo)
-        vertex, active = _step(vertex, onwards, sampler, depths, active)
-        return L, tangent, vertex, active, sampler
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        before: Vertex,
+        vertex: Vertex,
+        depths: Depths,
+        active: mi.Bool,
+        first: mi.Point3f,
+        L: mi.Spectrum,
+    ):
+        self.scattering = Scattering(scene, attached=True)
+        self.sampler, self.before, self.vertex = sampler, before, vertex
+        self.depths, self.active, self.L = depths, active, L
+        # Only a surface that is not diffuse notices from where it is looked at.
+        self.first = first if self.scattering.directional else mi.Point3f(0)
 
-    active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
-    tangent = dr.zeros(mi.Spectrum, dr.width(vertex.depth))
-    return dr.while_loop(
-        (mi.Spectrum(L), tangent, vertex, active, sampler),
-        lambda L, t, v, active, s: active,
-        bounce,
-        label="path replay",
-    )[1]
+    def forward(self, first: mi.Point3f) -> mi.Spectrum:
+        """Derivative of `scattered_light`, detached; with the derivative of the first vertex."""
+        return self._run(first, None)[0]
+
+    def backward(self, δL: mi.Spectrum) -> mi.Point3f:
+        """Propagate the gradient of a loss with respect to `scattered_light` to the parameters; returns the gradient
+        with respect to the first vertex."""
+        return self._run(None, δL)[1]
+
+    def _run(self, first: mi.Point3f | None, δL: mi.Spectrum | None) -> tuple[mi.Spectrum, mi.Point3f]:
+        scattering, depths, width = self.scattering, self.depths, dr.width(self.active)
+        # Inside of the loop, only memory can carry a gradient in or out.
+        with dr.resume_grad():
+            moves = scattering.directional and dr.grad_enabled(self.first)
+            if moves:
+                memory = dr.ravel(dr.detach(self.first))
+                dr.enable_grad(memory)
+                if first is not None:
+                    dr.set_grad(memory, dr.ravel(first))
+                dr.eval(memory, dr.grad(memory))
+
+        def bounce(L, tangent, before, vertex, active, sampler):
+            with dr.resume_grad():
+                follow = mi.RayFlags.FollowShape
+                si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All | follow, active)
+                if scattering.directional:
+                    x = before.pi.compute_surface_interaction(before.ray, mi.RayFlags.Minimal | follow, active).p
+                    if moves:
+                        seen = dr.gather(mi.Point3f, memory, dr.arange(mi.UInt32, width), active & (vertex.depth == 2))
+                        x = dr.select(vertex.depth == 2, seen, x)
+                    si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
+            direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), sampler, active)
+            L -= dr.select(active, vertex.β * dr.detach(direct), 0)
+            with dr.resume_grad():
+                # What comes from farther on, relative to its value.
+                weight = onwards.weight
+                rest = dr.select(dr.detach(weight) != 0, L * weight / dr.detach(weight), 0)
+                Lo = dr.select(active, vertex.β * direct + rest, 0)
+                if δL is None:
+                    tangent += dr.forward_to(Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+                else:
+                    dr.backward_from(δL * Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+            before = vertex
+            vertex, active = _step(vertex, onwards, sampler, depths, active)
+            return L, tangent, before, vertex, active, sampler
+
+        vertex = self.vertex
+        active = self.active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
+        tangent = dr.zeros(mi.Spectrum, width)
+        tangent = dr.while_loop(
+            (mi.Spectrum(self.L), tangent, self.before, vertex, active, self.sampler.clone()),
+            lambda L, t, b, v, active, s: active,
+            bounce,
+            label="path replay",
+        )[1]
+        with dr.resume_grad():
+            return tangent, dr.unravel(mi.Point3f, dr.grad(memory)) if moves else None
 
 
 def choose_vertex(
     scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, depths: Depths, active: mi.Bool
 ) -> tuple[Vertex, mi.Bool]:
-    """Follow paths from their first vertex, and keep one vertex of each, in proportion to its throughput (a reservoir of
-    one); its β is divided by its probability.
+    """Follow paths from their first vertex, and keep one vertex of each, in proportion to its throughput (a reservoir
+    of one); its β is divided by its probability.
 
     Returns
     -------

@@ -14,7 +14,7 @@ class Next:
     """The next vertex of a path, in the direction that was sampled from the BSDF.
 
     ray, pi : the ray to it, and what that meets. Detached.
-    weight : throughput of *scattered* light, mi.Spectrum; attached where wanted. The vertex is held fixed in space.
+    weight : throughput, mi.Spectrum; attached where wanted.
     η : relative index of refraction along the ray.
     """
 
@@ -32,32 +32,30 @@ class Scattering:
 
         f(ω) |cos θ_x| Lₑ(y, −ω) · |cos θ_y| dA / r²  /  p(ω),      ω = (y − x) / r,
 
-    where all factors but the density p follow the motion of x and y, dA by the change of the area of the triangle. For
-    scattered light, y is held fixed in space; the motion of its surface is felt where y scatters, since it is met by a
-    fixed ray. So the derivative at one vertex needs no other vertex to move (Worchel et al. 2025).
+    where all factors but the density p follow the motion of x and y, dA by the change of the area of the triangle. The
+    same holds for every next vertex of a path (Zhang et al. 2020). So what moves together sees no motion at all.
 
     attached : carry gradients? Otherwise values only.
-    continues : is the next vertex wanted?
     """
 
-    def __init__(self, scene: mi.Scene, *, attached: bool, continues: bool):
+    def __init__(self, scene: mi.Scene, *, attached: bool):
         self.scene = scene
         self.attached = attached
-        self.continues = continues
         flags = [e.flags() for e in scene.emitters()]
         self.any = bool(flags)
         self.any_delta = any(f & mi.EmitterFlags.Delta for f in flags)
         self.any_hit_by_rays = any(not f & mi.EmitterFlags.Delta for f in flags)
-        self.any_deforms = any(s.is_emitter() and s.parameters_grad_enabled() for s in scene.shapes())
+        self.any_deforms = any(s.parameters_grad_enabled() for s in scene.shapes())
         # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
-        self.any_mirror = any(s.bsdf() is None or s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes())
+        bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
+        self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
+        #: Does it matter from where a surface is looked at?
+        self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
 
     def scatter(self, si, bsdf, sampler, active) -> tuple[mi.Spectrum, Next | None]:
         """Direct illumination that `si` reflects, and the next vertex."""
         from_emitter = self.sample_emitter(si, bsdf, sampler, active) if self.any else 0
-        from_bsdf, onwards = mi.Spectrum(0), None
-        if self.any_hit_by_rays or self.continues:
-            from_bsdf, onwards = self.sample_bsdf(si, bsdf, sampler, active)
+        from_bsdf, onwards = self.sample_bsdf(si, bsdf, sampler, active)
         with dr.resume_grad(when=self.attached):
             return from_bsdf + from_emitter, onwards
 
@@ -111,7 +109,6 @@ class Scattering:
         mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
         pi = scene.ray_intersect_preliminary(ray, active=active)
-        onwards = Next(ray, pi, mi.Spectrum(weight), bs.eta) if self.continues else None
         if not self.attached:
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         else:
@@ -121,12 +118,6 @@ class Scattering:
                 ω = dr.select(on_surface, ω, ray.d)
                 f = bsdf.eval(context, si, si.to_local(ω), active & ~mirrored)
                 attached = f * (dr.select(on_surface, geometry, 1) / bs.pdf)
-                if self.continues:
-                    d = dr.detach(y.p) - si.p
-                    ω = dr.normalize(d)
-                    g = dr.abs_dot(dr.detach(y.n), ω) / dr.squared_norm(d)
-                    f = bsdf.eval(context, si, si.to_local(ω), on_surface & ~mirrored)
-                    held = f * (g / (dr.detach(g) * bs.pdf))
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
                     turned, at_mirror = bsdf.sample(context, si, sample1, sample2, active & mirrored)
@@ -135,17 +126,14 @@ class Scattering:
                     slid = pi.compute_surface_interaction(onwards_turned, mi.RayFlags.All, active & mirrored)
                     y = dr.select(mirrored, slid, y)
                     attached = dr.select(mirrored, at_mirror, attached)
-                    if self.continues:
-                        held = dr.select(mirrored, at_mirror, held)
-                if self.continues:
-                    onwards.weight = dr.replace_grad(weight, dr.select(active, held, 0))
-                weight = dr.replace_grad(weight, attached)
+                weight = dr.replace_grad(weight, dr.select(active, attached, 0))
         emitter = y.emitter(scene, active)
         ds = mi.DirectionSample3f(scene, y, si)
         pdf = scene.pdf_emitter_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
         mis = dr.select(mirrored, 1, mis_weight(bs.pdf, pdf))
         with dr.resume_grad(when=self.attached):
-            return dr.select(active, weight * emitter.eval(y, active) * mis, 0), onwards
+            Le = dr.select(active, weight * emitter.eval(y, active) * mis, 0)
+        return Le, Next(ray, pi, weight, bs.eta)
 
     def _connect(self, si, pi, ray, active):
         """The material point y that `pi` stands for, the direction ω from `si` to it, and |cos θ_y| dA / r² relative
