@@ -14,22 +14,29 @@ FLOOR = 0.01
 
 
 @dataclass
+class Lobe:
+    """Weight of directions near to an axis: peak · (1 + (tan θ / width)²)^(-3/2). Integrated along a line, this has a
+    closed form."""
+
+    axis: mi.Vector3f
+    peak: mi.Float
+    width: mi.Float
+
+
+@dataclass
 class View:
-    """From where the edges are looked at, and what is wanted of them.
+    """From where the edges are looked at, and what is wanted of them: a sum of weights of directions.
 
     p : mi.Vector3f, relative to the centre of the tree.
     n : mi.Vector3f, unit normal: directions below its plane are of no use. Zero where all are.
     wide : mi.Float, weight of all directions above the plane, by their cosine.
-    axis, peak, width : weight of directions ω near to a lobe's axis, peak · (1 + (tan θ / width)²)^(-3/2). Integrated
-        along a line, this has a closed form.
+    lobes : around which there is more.
     """
 
     p: mi.Vector3f
     n: mi.Vector3f
     wide: mi.Float
-    axis: mi.Vector3f
-    peak: mi.Float
-    width: mi.Float
+    lobes: list[Lobe]
 
 
 @dataclass
@@ -158,11 +165,12 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
     possible &= (above > 0) | dr.all(view.n == 0)
     cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(above * dr.rsqrt(r2), 0, 1))
     weight = view.wide * cosine
-    # How far from the axis of the lobe does the node begin?
-    along = dr.dot(view.axis, d)
-    off2 = dr.select(along > 0, dr.squared_norm(d) - along * along, r2)
-    gap2 = dr.square(dr.maximum(dr.safe_sqrt(off2) - dr.sqrt(size2), 0)) / r2
-    weight += view.peak * _lobe(gap2 / dr.square(view.width))
+    for lobe in view.lobes:
+        # How far from the axis does the node begin?
+        along = dr.dot(lobe.axis, d)
+        off2 = dr.select(along > 0, dr.squared_norm(d) - along * along, r2)
+        gap2 = dr.square(dr.maximum(dr.safe_sqrt(off2) - dr.sqrt(size2), 0)) / r2
+        weight += lobe.peak * _falloff(gap2 / dr.square(lobe.width))
     result = length * weight * (dr.rcp(r2) if from_light else dr.rsqrt(r2))
     return dr.select(possible & (length > 0) & dr.isfinite(result), result, 0)
 
@@ -173,8 +181,7 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     signs = [dr.dot(q, y) for q in slot.planes]
     edge_on = EDGE_ON * dr.norm(slot.a - view.p)
     silhouette = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
-    wide, narrow = _on_line(slot, view, from_light)
-    result = dr.select(silhouette, wide.total + narrow.total, 0)
+    result = dr.select(silhouette, sum(d.total for d in _on_line(slot, view, from_light)), 0)
     if from_light:
         result *= dr.rsqrt(dr.squared_norm(0.5 * (slot.a + slot.b) - view.p) + dr.squared_norm(slot.b - slot.a) / 12)
     ends = [dr.dot(view.n, v - view.p) > EDGE_ON * dr.norm(v - view.p) for v in (slot.a, slot.b)]
@@ -187,7 +194,7 @@ def _quadratic(y):
     return lambda m: sum(a * b for a, b in zip(m, products, strict=True))
 
 
-def _lobe(x: mi.Float) -> mi.Float:
+def _falloff(x: mi.Float) -> mi.Float:
     """(1 + x)^(-3/2)"""
     r = dr.rsqrt(1 + x)
     return r * r * r
@@ -233,11 +240,11 @@ class _Narrow:
 
     def pdf(self, s: mi.Float) -> mi.Float:
         x = (s - self.closest) / self.a
-        return _lobe(x * x) / (self.a * self.extent)
+        return _falloff(x * x) / (self.a * self.extent)
 
 
-def _on_line(slot: Slot, view: View, from_light: bool) -> tuple[_Wide, _Narrow]:
-    """Both densities on an edge, by length along it, with their weights."""
+def _on_line(slot: Slot, view: View, from_light: bool) -> list[_Wide | _Narrow]:
+    """Densities on an edge, by length along it, with their weights: that of all directions, and of each lobe."""
     a, e = slot.a - view.p, slot.b - slot.a
     length = dr.norm(e)
     e /= length
@@ -252,29 +259,37 @@ def _on_line(slot: Slot, view: View, from_light: bool) -> tuple[_Wide, _Narrow]:
     cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(dr.dot(view.n, middle), 0, 1) + margin)
     wide = _Wide(foot, h, start, angle, view.wide * cosine * angle)
 
-    across = lambda v: v - view.axis * dr.dot(view.axis, v)
+    return [wide, *(_narrow(lobe, a, e, length, h) for lobe in view.lobes)]
+
+
+def _narrow(lobe: Lobe, a: mi.Vector3f, e: mi.Vector3f, length: mi.Float, h: mi.Float) -> _Narrow:
+    """a : one end, seen from the viewer; e : direction of the edge; h : distance of its line."""
+    across = lambda v: v - lobe.axis * dr.dot(lobe.axis, v)
     a_across, e_across = across(a), across(e)
     g2 = dr.maximum(dr.squared_norm(e_across), 1e-6)
     closest = dr.clip(-dr.dot(a_across, e_across) / g2, 0, length)
     c = a + closest * e
     r2 = dr.squared_norm(c)
-    behind = dr.dot(view.axis, c) <= 0
+    behind = dr.dot(lobe.axis, c) <= 0
     off2 = dr.select(behind, r2, dr.squared_norm(a_across + closest * e_across))
-    A2 = dr.square(view.width) * r2
+    A2 = dr.square(lobe.width) * r2
     k = dr.sqrt((A2 + off2) / g2)
     at = lambda s: (s - closest) / k * dr.rsqrt(1 + dr.square((s - closest) / k))
     start = at(mi.Float(0))
     extent = dr.maximum(at(length) - start, 1e-7)
-    total = view.peak * A2 * dr.sqrt(A2) / (g2 * dr.sqrt(g2) * k * k) * extent * h / r2
-    return wide, _Narrow(closest, k, start, extent, dr.select(dr.isfinite(total), total, 0))
+    total = lobe.peak * A2 * dr.sqrt(A2) / (g2 * dr.sqrt(g2) * k * k) * extent * h / r2
+    return _Narrow(closest, k, start, extent, dr.select(dr.isfinite(total), total, 0))
 
 
 def _sample_point(slot: Slot, view: View, from_light: bool, choice: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Parameter t of a point on the edge, and its density."""
-    wide, narrow = _on_line(slot, view, from_light)
-    p = narrow.total / (wide.total + narrow.total)
-    p = dr.select(dr.isfinite(p), p, 0)
     length = dr.norm(slot.b - slot.a)
-    s = dr.select(choice < p, narrow.sample(u), wide.sample(u))
+    densities = _on_line(slot, view, from_light)
+    total = sum(d.total for d in densities)
+    s, below = densities[0].sample(u), densities[0].total
+    for d in densities[1:]:
+        s = dr.select(choice * total < below, s, d.sample(u))
+        below = below + d.total  # not in place: it is the total of a density
     s = dr.clip(s, 0, length)
-    return s / length, dr.lerp(wide.pdf(s), narrow.pdf(s), p) * length
+    pdf = sum(d.total * d.pdf(s) for d in densities) / total
+    return s / length, pdf * length

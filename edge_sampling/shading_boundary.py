@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .edge_importance import EdgeSample, View, sample_edge
+from .edge_importance import EdgeSample, Lobe, View, sample_edge
 from .edge_tree import EdgeTree
 from .edges import Edges
 from .meshes import Geometry
@@ -86,10 +86,10 @@ class ShadingBoundary:
         self.from_lights_possible = bool(surface)
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
-        glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
+        self.glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
         others = any(not e.flags() & (mi.EmitterFlags.Delta | mi.EmitterFlags.Surface) for e in emitters)
         #: Is emitted light sampled from points, too? Diffuse surfaces find the lights themselves, from the lights.
-        self.emission_from_points = glossy or others
+        self.emission_from_points = self.glossy or others
 
     def refit(self) -> None:
         """Follow the vertices. To be called before sampling."""
@@ -125,24 +125,40 @@ class ShadingBoundary:
             for mesh in self.moving_meshes:
                 moves |= si.shape == mi.ShapePtr(mesh)
             active = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            bs, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
-            found = active & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            peak = dr.select(found, bs.pdf, 0)
-            diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
             facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
             view = View(
                 mi.Vector3f(si.p - self.tree.centre),
                 facing,
-                dr.select(diffuse, dr.inv_pi, 0.1 * dr.inv_pi),
-                dr.select(found, si.to_world(bs.wo), mi.Vector3f(0, 0, 1)),
-                peak,
-                # As wide as a lobe of that density.
-                dr.clip(dr.rsqrt(dr.pi * dr.maximum(peak, 1e-3)), 1e-5, 1),
+                dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), dr.inv_pi, 0.1 * dr.inv_pi),
+                self._lobes(scene, si, bsdf, sampler, active, scattered is not None),
             )
             use = [True, moves] if len(self.groups) == 2 else [True]
             e = sample_edge(self.tree, view, sampler, use, from_light=False, active=active)
         weight = lambda a, b: dr.select(share_emission, _share(b, a), 1)
         return self._evaluate(scene, si, e, sampler, active, weight, emission=emission, scattered=scattered)
+
+    def _lobes(self, scene, si, bsdf, sampler, active, towards_lights: bool) -> list[Lobe]:
+        """Around which directions to look for edges more closely: one that is sampled from the BSDF, and one towards a
+        light.
+
+        Since lobes only guide the choice, they may be as random as this; and nothing about a BSDF must be known but
+        how to sample it.
+        """
+        lobes = []
+        # As wide as a lobe of that density.
+        width = lambda pdf: dr.clip(dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-3)), 1e-5, 1)
+        if self.glossy:
+            bs, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
+            found = active & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            axis = dr.select(found, si.to_world(bs.wo), mi.Vector3f(0, 0, 1))
+            lobes.append(Lobe(axis, dr.select(found, bs.pdf, 0), width(bs.pdf)))
+        if self.from_lights_possible and towards_lights:
+            light, _ = scene.sample_emitter_direction(si, sampler.next_2d(active), False, active)
+            found = active & (light.pdf > 0) & ~light.delta
+            axis = dr.select(found, light.d, mi.Vector3f(0, 0, 1))
+            # An edge across the light then counts about as much as all others together.
+            lobes.append(Lobe(axis, dr.select(found, 0.5 / width(light.pdf), 0), width(light.pdf)))
+        return lobes
 
     # ---------------------- From lights ----------------------
 
@@ -172,8 +188,7 @@ class ShadingBoundary:
 
             # ---------------------- An edge as seen from there ----------------------
 
-            zero = dr.zeros(mi.Float, count)
-            view = View(mi.Vector3f(y.p - self.tree.centre), y.n, zero + 1, mi.Vector3f(0, 0, 1), zero, zero + 1)
+            view = View(mi.Vector3f(y.p - self.tree.centre), y.n, dr.full(mi.Float, 1, count), [])
             e = sample_edge(self.tree, view, sampler, [True] * len(self.groups), from_light=True, active=active)
             active &= e.density > 0
             positions = dr.detach(self.geometry.positions())

@@ -27,6 +27,9 @@ HARD_SHADOWS = (
     'give them a size, or set "sppi" to 0 to accept this.'
 )
 
+#: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
+LINE = 16
+
 
 @dataclass
 class Sample:
@@ -288,8 +291,14 @@ class EdgeIntegrator(ADIntegrator):
 
     def _film_boundary(self, scene, sensor, seed, sppp, weights, boundary: FilmBoundary) -> Term:
         """Visibility as seen from the sensor."""
-        sampler, _ = self._sampler(sensor, 0xFFFFFFFF ^ seed, sppp)
-        s = boundary.sample(sensor, sampler, sampler.wavefront_size(), lambda *args: self._beside_edge(scene, *args))
+        width, height = self._size(sensor.film())
+        # A line covers few pixels: unless a number of samples was asked for, so many a pixel of it are enough.
+        count = sppp * (width * height if self.sppp else min(width * height, LINE * (width + height)))
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(1)
+        sampler.set_samples_per_wavefront(1)
+        sampler.seed(0xFFFFFFFF ^ seed, count)
+        s = boundary.sample(sensor, sampler, count, lambda *args: self._beside_edge(scene, *args))
         with dr.resume_grad():
             return Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0)
 
@@ -404,14 +413,19 @@ class EdgeIntegrator(ADIntegrator):
         return 0 if own == 0 else spp or own or sensor.sampler().sample_count()
 
     @staticmethod
+    def _size(film: mi.Film) -> tuple[int, int]:
+        """Width and height of what is sampled, in pixels."""
+        border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+        return tuple(int(n) + border for n in film.crop_size())
+
+    @staticmethod
     def _sampler(sensor: mi.Sensor, seed: int, spp: int) -> tuple[mi.Sampler, int]:
         """A sampler for one wavefront over the film, and its samples per pixel (some kinds round them up)."""
-        film = sensor.film()
-        size = np.array(film.crop_size()) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
+        width, height = EdgeIntegrator._size(sensor.film())
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()
-        count = int(np.prod(size)) * spp
+        count = width * height * spp
         if count > 2**32:
             raise RuntimeError(
                 f"{count} samples in one wavefront exceed 2^32: use fewer samples per pixel and average several seeds"

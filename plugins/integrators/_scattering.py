@@ -45,7 +45,8 @@ class Scattering:
         self.any = bool(flags)
         self.any_delta = any(f & mi.EmitterFlags.Delta for f in flags)
         self.any_hit_by_rays = any(not f & mi.EmitterFlags.Delta for f in flags)
-        self.any_deforms = any(s.parameters_grad_enabled() for s in scene.shapes())
+        self.any_elsewhere = any(not f & (mi.EmitterFlags.Delta | mi.EmitterFlags.Surface) for f in flags)
+        self.moving = [mi.ShapePtr(s) for s in scene.shapes() if s.parameters_grad_enabled()]
         # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
@@ -89,10 +90,10 @@ class Scattering:
             y, ω, geometry = self._connect(si, pi, ray, on_surface & visible)
             direction = dr.select(on_surface, ω, ds.d)
             # Lights at infinity: the direction is fixed.
-            elsewhere = scene.eval_emitter_direction(si, ds, active & ~on_surface & ~ds.delta) / ds.pdf
-            attached = dr.select(
-                on_surface, y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf), elsewhere
-            )
+            attached = y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf)
+            if self.any_elsewhere:
+                elsewhere = scene.eval_emitter_direction(si, ds, active & ~on_surface & ~ds.delta) / ds.pdf
+                attached = dr.select(on_surface, attached, elsewhere)
             if self.any_delta:
                 moved, at_delta = scene.sample_emitter_direction(si, sample, False, active & ds.delta)
                 direction = dr.select(ds.delta, moved.d, direction)
@@ -144,19 +145,24 @@ class Scattering:
         ω = d * dr.rsqrt(r2)
         y.wi = dr.replace_grad(y.wi, y.to_local(-ω))
         geometry = dr.abs_dot(y.n, ω) / r2
-        if self.any_deforms:
+        if self.moving:
             geometry *= self._area(pi, ray, active)
         return y, ω, geometry / dr.detach(geometry)
 
     def _area(self, pi, ray, active):
-        """Twice the area of the triangles hit, attached."""
+        """Twice the area of the triangles hit, attached; 1 where they do not move."""
+        moves = mi.Bool(False)
+        for shape in self.moving:
+            moves |= pi.shape == shape
+        moves &= active
         corners = []
         for u, v in ((0, 0), (1, 0), (0, 1)):
             corner = mi.PreliminaryIntersection3f(pi)
             corner.prim_uv = mi.Point2f(u, v)
             flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-            corners.append(corner.compute_surface_interaction(ray, flags, active).p)
-        return dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+            corners.append(corner.compute_surface_interaction(ray, flags, moves).p)
+        area = dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        return dr.select(moves, area, 1)
 
 
 def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
