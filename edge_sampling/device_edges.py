@@ -16,13 +16,16 @@ COPLANAR = 1e-5
 class DeviceEdges:
     """Topology of `Edges` as Dr.Jit arrays. Vertex positions are given with each call, since they change."""
 
+    # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
+    DRJIT_STRUCT = dict.fromkeys(("count", "_ends", "_opposite", "_kind", "_kinds", "_any_split"))
+
     def __init__(self, edges: Edges):
         index = lambda a: mi.UInt32(np.ascontiguousarray(a))
         self.count = len(edges)
         self._ends = [[index(edges.vertices[:, side, k]) for k in (0, 1)] for side in (0, 1)]
         self._opposite = [index(edges.opposite[:, side]) for side in (0, 1)]
         self._kind = index(edges.kind)
-        self._kinds = set(edges.kind)
+        self._kinds = frozenset(edges.kind)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:

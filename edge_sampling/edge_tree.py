@@ -104,6 +104,11 @@ class EdgeTree:
     groups : indices into `edges`, a tree for each; without the empty ones.
     """
 
+    _NUMBERS = ("depths", "node_offsets", "leaf_offsets")
+    DRJIT_STRUCT = dict.fromkeys(  # for `dr.freeze`
+        ("device_edges", "centre", "slot_edge", "_used", "_open", "nodes", "slots", *_NUMBERS)
+    )
+
     def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray]):
         self.geometry = geometry
         self.device_edges = DeviceEdges(edges)

@@ -55,6 +55,8 @@ class FilmBoundary:
     faces : (F, 3), vertex indices of the faces that can, on the host.
     """
 
+    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "count"))  # for `dr.freeze`
+
     def __init__(self, geometry: Geometry, edges: Edges, faces: np.ndarray):
         self.geometry = geometry
         self.edges = DeviceEdges(edges)
@@ -126,6 +128,9 @@ class FilmBoundary:
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
             n_dl = dr.select(active, n_dl, 0)
+            if projection.attached:
+                # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
+                dr.eval(jump, alpha_jump, n_dl)
         with dr.resume_grad():
             normal_velocity = dr.dot(n_dl, velocity)
             return BoundarySamples(u, jump * normal_velocity, alpha_jump * normal_velocity, ray.wavelengths)

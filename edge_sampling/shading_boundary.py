@@ -65,6 +65,9 @@ class ShadingBoundary:
         still only moving edges do.
     """
 
+    _NUMBERS = ("everything", "from_lights_possible", "transmits", "glossy", "emission_from_points")
+    DRJIT_STRUCT = dict.fromkeys(("tree", "moving_shapes", "surface_lights", *_NUMBERS))  # for `dr.freeze`
+
     def __init__(
         self,
         scene: mi.Scene,
@@ -75,14 +78,14 @@ class ShadingBoundary:
         everything: bool,
     ):
         self.geometry = geometry
-        self.moving_meshes = [m for m, moves in zip(geometry.meshes, moving, strict=True) if moves]
+        self.moving_shapes = [mi.ShapePtr(m) for m, moves in zip(geometry.meshes, moving, strict=True) if moves]
         self.everything = everything
         moves = np.array(moving)[edges.mesh].any(axis=1) if not everything else np.ones(len(edges), bool)
         self.groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         self.tree = EdgeTree(geometry, edges, self.groups)
         emitters = scene.emitters()
         surface = [i for i, e in enumerate(emitters) if e.flags() & mi.EmitterFlags.Surface]
-        self.surface_lights = mi.UInt32(surface)
+        self.surface_lights = mi.UInt32(surface or [0])  # Dr.Jit 1.5 cannot freeze empty arrays
         self.from_lights_possible = bool(surface)
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
@@ -122,8 +125,8 @@ class ShadingBoundary:
         with dr.suspend_grad():
             bsdf = si.bsdf()
             moves = mi.Bool(self.everything)
-            for mesh in self.moving_meshes:
-                moves |= si.shape == mi.ShapePtr(mesh)
+            for shape in self.moving_shapes:
+                moves |= si.shape == shape
             active = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
             view = View(
@@ -301,6 +304,8 @@ class ShadingBoundary:
             if scattered is not None:
                 L += dr.select(valid, scattered(ray, pi, sampler, valid), 0)
             L = dr.select(active, f * L, 0)
+            if self.everything:
+                dr.eval(L, n_dl)  # as in `FilmBoundary.sample`
 
         with dr.resume_grad():
             a, b = edges.end_points(positions, sample.edge)

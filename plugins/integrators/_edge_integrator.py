@@ -333,10 +333,26 @@ class EdgeIntegrator(ADIntegrator):
 
     # ---------------------- What moves ----------------------
 
+    def find_boundaries(self, scene, sensor=0) -> Boundaries | None:
+        """Find the edges that can contribute to a derivative with respect to the parameters that carry a gradient now.
+
+        Derivatives do this by themselves, but not inside of a function that `dr.freeze` records, since the search runs
+        on the host. Give this as the function's `state_fn`.
+
+        Returns
+        -------
+        What a frozen function depends on (a PyTree), or None where nothing moves.
+        """
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        with dr.suspend_grad():
+            return self._boundaries_of(scene, sensor, self._override(self.sppi, 0, sensor))
+
     def _boundaries_of(self, scene, sensor, sppi) -> Boundaries | None:
         """The edges that can contribute, or None where nothing moves."""
         geometry = Geometry.of(scene)
         if self._geometry is None or self._geometry.key() != geometry.key():
+            self._refuse_while_recording()
             self._geometry = geometry
             self._edges = find_edges(geometry)
             self._boundaries = {}
@@ -359,6 +375,7 @@ class EdgeIntegrator(ADIntegrator):
             return None
         key = (moving, camera_moves)
         if key not in self._boundaries:
+            self._refuse_while_recording()
             self._warn_of_limits(scene, sppi)
             on_film = tuple(m or camera_moves for m in moving)
             edges = self._edges.of_meshes(np.array(on_film))
@@ -367,6 +384,13 @@ class EdgeIntegrator(ADIntegrator):
                 self._shading_boundary(scene, moving, camera_moves),
             )
         return self._boundaries[key]
+
+    def _refuse_while_recording(self) -> None:
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise RuntimeError(
+                f"{self.name}: a frozen function cannot find the edges. Let it do so before: "
+                "`@dr.freeze(state_fn=lambda scene, integrator, *_: integrator.find_boundaries(scene))`."
+            )
 
     def _shading_boundary(self, scene, moving, camera_moves) -> ShadingBoundary | None:
         if not scene.emitters() or not len(self._edges) or not self.depths.scatters(1):
@@ -419,7 +443,7 @@ class EdgeIntegrator(ADIntegrator):
         return tuple(int(n) + border for n in film.crop_size())
 
     @staticmethod
-    def _sampler(sensor: mi.Sensor, seed: int, spp: int) -> tuple[mi.Sampler, int]:
+    def _sampler(sensor: mi.Sensor, seed: int | mi.UInt32, spp: int) -> tuple[mi.Sampler, int]:
         """A sampler for one wavefront over the film, and its samples per pixel (some kinds round them up)."""
         width, height = EdgeIntegrator._size(sensor.film())
         sampler = sensor.sampler().clone()

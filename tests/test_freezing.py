@@ -1,0 +1,229 @@
+"""Optimisation steps as frozen functions (`dr.freeze`): recorded once, replayed with new values, equal to unfrozen."""
+
+from __future__ import annotations
+
+import cases
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+STEPS = 4
+
+
+def numbers(value):
+    """A detached copy in Dr.Jit's own memory. The vertices of `cases.mesh` lie in NumPy's, see the documentation."""
+    if isinstance(value, mi.Transform4f):
+        return mi.Transform4f(value)
+    value = type(value)(dr.detach(value)) * dr.opaque(mi.Float, 1)
+    dr.eval(value)
+    return value
+
+
+def moved(initial, theta):
+    """The parameter at a distance or, for colours, a relative change theta."""
+    if isinstance(initial, mi.Transform4f):
+        return mi.Transform4f().translate([theta, 0.5 * theta, 0]) @ initial
+    return initial + theta
+
+
+def loss_of(image):
+    return dr.mean(dr.square(image - 0.2), axis=None)
+
+
+class Step:
+    """The step that is frozen: render, compare, differentiate. It counts how often Python executes it."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, scene, integrator, seed):
+        self.calls += 1
+        loss = loss_of(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=4, seed=seed))
+        dr.backward(loss)
+        return loss.array
+
+    def frozen(self):
+        def step(scene, integrator, seed):
+            return self(scene, integrator, seed)
+
+        return dr.freeze(step, state_fn=lambda scene, integrator, *_: integrator.find_boundaries(scene))
+
+
+def losses_and_gradients(step, scene, integrator, key, initial):
+    """Loss and its derivative, for other values and random numbers each time: (STEPS, 2)."""
+    params, result = mi.traverse(scene), []
+    for i in range(STEPS):
+        theta = dr.opaque(mi.Float, 0.02 * i)
+        dr.enable_grad(theta)
+        params[key] = moved(initial, theta)
+        params.update()
+        loss = step(scene, integrator, dr.opaque(mi.UInt32, 7 * i))
+        result.append((loss[0], dr.grad(theta)[0]))
+    return np.array(result)
+
+
+def assert_same(frozen, unfrozen):
+    """Equal but for the order of additions."""
+    scale = np.abs(unfrozen).max(axis=0)
+    assert (scale > 0).all() and (np.abs(np.diff(unfrozen, axis=0)).max(axis=0) > 1e-3 * scale).all()
+    np.testing.assert_allclose(frozen / scale, unfrozen / scale, rtol=0, atol=1e-5)
+
+
+VALUES = [
+    ("two_triangles", "green.vertex_positions"),
+    ("two_triangles", "red.bsdf.reflectance.value"),
+    ("room", "cube.vertex_positions"),
+    ("room", "light.to_world"),
+    ("room", "sensor.to_world"),
+    ("room", "light.emitter.radiance.value"),
+    ("cube", "cube.vertex_positions"),  # with normals, under a sky: no light has a surface
+]
+SCENES = {"two_triangles": cases.two_triangles, "room": cases.room(), "cube": cases.cube()}
+
+
+@pytest.mark.parametrize(
+    ("kind", "scene", "key"),
+    [(kind, *value) for kind in ("direct_edge", "prb_edge") for value in VALUES],
+    ids=lambda text: text,
+)
+def test_replay_sees_new_values(kind, scene, key):
+    scene, integrator = SCENES[scene](), mi.load_dict({"type": kind})
+    initial = numbers(mi.traverse(scene)[key])
+    unfrozen = losses_and_gradients(Step(), scene, integrator, key, initial)
+    step = Step()
+    frozen = step.frozen()
+    assert_same(losses_and_gradients(frozen, scene, integrator, key, initial), unfrozen)
+    assert step.calls == frozen.n_recordings == 1
+
+
+def test_first_call_may_be_frozen():
+    """Nothing has been rendered before: `state_fn` finds the edges."""
+    scene, integrator = cases.two_triangles(), mi.load_dict({"type": "direct_edge"})
+    initial = numbers(mi.traverse(scene)["green.vertex_positions"])
+    arguments = scene, integrator, "green.vertex_positions", initial
+    frozen = losses_and_gradients(Step().frozen(), *arguments)
+    assert_same(frozen, losses_and_gradients(Step(), *arguments))
+
+
+def test_integrator_of_the_scene():
+    """Arrays that the integrator holds are found through the scene, too."""
+    scene = cases.scene(
+        sensor=cases.camera(), cube=cases.smooth_cube(), sky=cases.constant(), integrator={"type": "direct_edge"}
+    )
+    key = "cube.vertex_positions"
+    initial = numbers(mi.traverse(scene)[key])
+
+    def step(scene, seed):
+        loss = loss_of(mi.render(scene, mi.traverse(scene), spp=4, seed=seed))
+        dr.backward(loss)
+        return loss.array
+
+    frozen = dr.freeze(step, state_fn=lambda scene, *_: scene.integrator().find_boundaries(scene))
+    results = []
+    for function in (frozen, step):
+        adapted = lambda scene, _, seed, function=function: function(scene, seed)
+        results.append(losses_and_gradients(adapted, scene, None, key, initial))
+    assert_same(*results)
+    assert frozen.n_recordings <= 2  # the first call makes the film's storage
+
+
+def test_whole_step_of_a_material():
+    """All inside: update, rendering, gradient, optimiser."""
+    scene, integrator = cases.two_triangles(), mi.load_dict({"type": "direct_edge"})
+    key = "red.bsdf.reflectance.value"
+
+    def step(scene, integrator, optimiser, seed):
+        params = mi.traverse(scene)
+        params.update(optimiser)
+        dr.backward(loss_of(mi.render(scene, params, integrator=integrator, spp=4, seed=seed)))
+        optimiser.step()
+
+    def fit(step):
+        optimiser = mi.ad.Adam(lr=0.05)
+        optimiser[key] = mi.Color3f(0.7, 0.3, 0.4)
+        for i in range(8):
+            step(scene, integrator, optimiser, dr.opaque(mi.UInt32, i))
+        return dr.detach(optimiser[key]).numpy()
+
+    expected, frozen = fit(step), dr.freeze(step)
+    np.testing.assert_allclose(fit(frozen), expected, rtol=1e-5)
+    assert frozen.n_recordings <= 2
+    assert np.abs(expected.ravel() - [0.7, 0.3, 0.4]).max() > 0.05
+
+
+def test_fit_of_a_shape():
+    """The shape is updated, and the optimiser takes its steps, outside."""
+    scene, integrator = cases.cube()(), mi.load_dict({"type": "direct_edge"})
+    key = "cube.vertex_positions"
+    initial = dr.unravel(mi.Point3f, numbers(mi.traverse(scene)[key]))
+
+    def fit(step):
+        params, optimiser = mi.traverse(scene), mi.ad.Adam(lr=0.02)
+        optimiser["shift"] = mi.Vector3f(0.3, -0.2, 0.1)
+        for i in range(8):
+            params[key] = dr.ravel(initial + optimiser["shift"])
+            params.update()
+            step(scene, integrator, dr.opaque(mi.UInt32, i))
+            optimiser.step()
+        return dr.detach(optimiser["shift"]).numpy()
+
+    expected, frozen = fit(Step()), Step().frozen()
+    np.testing.assert_allclose(fit(frozen), expected, atol=1e-4)
+    assert frozen.n_recordings == 1
+
+
+def test_other_scenes_and_parameters():
+    """With other scenes, or where other parameters move, the function is recorded again."""
+    scenes, integrator = (cases.two_triangles(), cases.two_triangles()), mi.load_dict({"type": "direct_edge"})
+    keys = "green.vertex_positions", "sensor.to_world", "red.bsdf.reflectance.value"
+    initial = [{key: numbers(mi.traverse(scene)[key]) for key in keys} for scene in scenes]
+
+    def sequence(step):
+        result = []
+        for i in range(6):
+            which, params = i % 2, mi.traverse(scenes[i % 2])
+            for k, key in enumerate(keys):
+                theta = dr.opaque(mi.Float, 0.02 * i + 0.1 * which)
+                if k == i // 2:
+                    dr.enable_grad(theta)
+                    wanted = theta
+                params[key] = moved(initial[which][key], theta)
+            params.update()
+            loss = step(scenes[which], integrator, dr.opaque(mi.UInt32, i))
+            result.append((loss[0], dr.grad(wanted)[0]))
+        return np.array(result)
+
+    expected, frozen = sequence(Step()), Step().frozen()
+    np.testing.assert_allclose(sequence(frozen), expected, rtol=1e-4, atol=1e-9)
+    assert frozen.n_recordings == 6
+
+
+def test_all_that_is_read_is_known_to_frozen_functions():
+    """Whoever adds an attribute names it in `DRJIT_STRUCT`, or here, if it is not read when sampling."""
+    scene, integrator = cases.room()(), mi.load_dict({"type": "prb_edge"})
+    dr.enable_grad(mi.traverse(scene)["cube.vertex_positions"])
+    boundaries = integrator.find_boundaries(scene)
+    shading, film = boundaries.shading, boundaries.film
+    for part, unread in (
+        (film, {"geometry"}),
+        (film.edges, set()),
+        (shading, {"geometry", "groups"}),
+        (shading.tree, {"geometry"}),
+    ):
+        assert vars(part).keys() - unread == type(part).DRJIT_STRUCT.keys(), type(part).__name__
+
+
+def test_says_that_the_edges_must_be_found_before():
+    scene, integrator = cases.two_triangles(), mi.load_dict({"type": "direct_edge"})
+    params = mi.traverse(scene)
+    key = "green.vertex_positions"
+    params[key] = numbers(params[key])
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(RuntimeError) as error:
+        dr.freeze(Step().__call__)(scene, integrator, dr.opaque(mi.UInt32, 0))
+    cause = error.value
+    while cause.__cause__ is not None:
+        cause = cause.__cause__
+    assert "state_fn" in str(cause) and "find_boundaries" in str(cause)
