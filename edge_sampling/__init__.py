@@ -1,8 +1,11 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
+from .edge_importance import EdgeSample, Lobe, View, sample_edge
+from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, find_edges
 from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
+from .intersections import intersecting_meshes
 from .meshes import Geometry, jumping_textures
 from .motion import Motion, derivative_image
 from .projection import Projection
@@ -12,17 +15,23 @@ from .zscores import mean_and_error, z_scores
 __all__ = [
     "BoundarySamples",
     "EdgeKind",
+    "EdgeSample",
+    "EdgeTree",
     "Edges",
     "FilmBoundary",
     "FiniteDifferences",
     "Geometry",
+    "Lobe",
     "Motion",
     "Projection",
     "ShadingBoundary",
+    "View",
     "derivative_image",
     "find_edges",
     "finite_differences",
+    "intersecting_meshes",
     "jumping_textures",
     "mean_and_error",
+    "sample_edge",
     "z_scores",
 ]

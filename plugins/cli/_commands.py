@@ -198,6 +198,33 @@ class Params(_OnScene):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanCommand(_OnSensor):
+    """Print what a derivative needs: which terms, of how many edges, at what cost."""
+
+    param: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KEY")] = ()
+    """Parameter that moves; `rimlight params` lists them. May be repeated. Default: the camera and all vertices."""
+    integrator: str = "prb_edge"
+    """Plugin that renders: direct_edge or prb_edge."""
+    spp: int = 16
+    """Samples per pixel."""
+
+    def run(self) -> int:
+        at_least(1, spp=self.spp)
+        scene = self.load()
+        integrator = _loading.load_integrator(self.integrator)
+        if not hasattr(integrator, "plan"):
+            raise InputError(f'--integrator: "{self.integrator}" has no plan, use direct_edge or prb_edge')
+        keys = list(self.param) or [
+            key
+            for key, _, _ in _loading.differentiable(scene)
+            if key.endswith("vertex_positions") or key == _loading.camera_key(scene, self.sensor)
+        ]
+        with expected(ValueError, RuntimeError, pattern=REFUSAL):
+            print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Render(_OnSensor):
     """Render a scene to an EXR and a PNG file."""
 
@@ -405,6 +432,7 @@ class Demo:
 COMMANDS = {
     "sys-info": SysInfo,
     "params": Params,
+    "plan": PlanCommand,
     "render": Render,
     "gradient": Gradient,
     "check": Check,

@@ -10,12 +10,14 @@ import mitsuba as mi
 import numpy as np
 from mitsuba.ad.integrators.common import ADIntegrator
 
+from rimlight._plan import Plan, PlannedTerm, names
 from rimlight.edge_sampling import (
     Edges,
     FilmBoundary,
     Geometry,
     ShadingBoundary,
     find_edges,
+    intersecting_meshes,
     jumping_textures,
 )
 
@@ -29,6 +31,9 @@ HARD_SHADOWS = (
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
 LINE = 16
+
+#: Longest path that a plan counts rays of.
+LONG = 16
 
 
 @dataclass
@@ -65,10 +70,13 @@ class Term:
 @dataclass(frozen=True)
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
-    does."""
+    does. Nothing where nothing moves. `limits` : what the derivative will lack."""
 
-    film: FilmBoundary
-    shading: ShadingBoundary | None
+    film: FilmBoundary | None = None
+    shading: ShadingBoundary | None = None
+    moving: tuple[bool, ...] = ()
+    camera_moves: bool = False
+    limits: tuple[str, ...] = ()
 
 
 class EdgeIntegrator(ADIntegrator):
@@ -262,21 +270,21 @@ class EdgeIntegrator(ADIntegrator):
         """What makes the samples of each term of the derivative."""
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        sppc, sppp, sppi = (self._override(own, spp, sensor) for own in (self.sppc, self.sppp, self.sppi))
+        sppc, sppp, sppi = self._counts(spp, sensor)
         boundaries = self._boundaries_of(scene, sensor, sppi)
         # Without interior samples, zeros still tell how much the filter weighs at each pixel. There, the weights of the
         # interior samples add up to `weights` times the integral of the filter. The film divides by that sum: so
         # samples of boundaries, of weight zero, are normalised as the image is, for every filter.
         sampler, weights = self._sampler(sensor, seed, sppc or 16)
         terms = [lambda: self._interior(scene, sensor, sampler, weights, mode, sppc > 0)]
-        if boundaries is not None and sppp > 0:
-            terms.append(lambda: self._film_boundary(scene, sensor, seed, sppp, weights, boundaries.film))
-        shading = boundaries.shading if boundaries is not None and sppi > 0 else None
-        if shading is not None:
+        film, shading = boundaries.film, boundaries.shading
+        if film is not None and sppp > 0:
+            terms.append(lambda: self._film_boundary(scene, sensor, seed, sppp, weights, film))
+        if shading is not None and sppi > 0:
             shading.refit()
             if shading.from_lights_possible:
                 terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, shading))
-            if self.depths.scatters(2) or shading.emission_from_points:
+            if self._looks_from_points(shading):
                 terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, shading))
         return sensor.film(), terms
 
@@ -291,9 +299,7 @@ class EdgeIntegrator(ADIntegrator):
 
     def _film_boundary(self, scene, sensor, seed, sppp, weights, boundary: FilmBoundary) -> Term:
         """Visibility as seen from the sensor."""
-        width, height = self._size(sensor.film())
-        # A line covers few pixels: unless a number of samples was asked for, so many a pixel of it are enough.
-        count = sppp * (width * height if self.sppp else min(width * height, LINE * (width + height)))
+        count = self._line_samples(sensor, sppp)
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(1)
         sampler.set_samples_per_wavefront(1)
@@ -331,6 +337,67 @@ class EdgeIntegrator(ADIntegrator):
             film.put_block(block)
         return film.develop()
 
+    # ---------------------- Plan ----------------------
+
+    def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:
+        """What a derivative with respect to the parameters that carry a gradient now will do, see `rimlight.plan`."""
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        sppc, sppp, sppi = self._counts(spp, sensor)
+        with dr.suspend_grad():
+            boundaries = self._boundaries_of(scene, sensor, sppi)
+        width, height = self._size(sensor.film())
+        pixels, segments = width * height, min(self.depths.max_depth, LONG)
+        film, shading = boundaries.film, boundaries.shading
+        path = 1 + 2 * max(segments - 1, 0)
+        terms = [
+            PlannedTerm("interior", sppc * pixels, path + (segments > 2) * 2 * (path - 3), "always")
+            if sppc
+            else PlannedTerm("interior", 0, 0, '"sppc" is 0')
+        ]
+
+        def add(name, samples, rays, needed, why, why_not):
+            samples = samples if needed else 0
+            terms.append(PlannedTerm(name, samples, rays if samples else 0, why if samples else why_not))
+
+        still = "nothing moves" if film is None else '"sppi" is 0' if not sppi else "nothing is lit"
+        add(
+            "film boundary",
+            self._line_samples(sensor, sppp),
+            2 * path,
+            film is not None and sppp,
+            f"{film.edges.count if film else 0} edges may move on the film",
+            "nothing moves" if film is None else '"sppp" is 0',
+        )
+        lights = shading is not None and shading.from_lights_possible
+        add(
+            "shadows from lights",
+            sppi * pixels,
+            3,
+            lights,
+            f"{dr.width(shading.surface_lights) if lights else 0} lights of finite size",
+            still if shading is None else "no light of finite size",
+        )
+        add(
+            "edges from points",
+            sppi * pixels,
+            1 + path,
+            shading is not None and self._looks_from_points(shading),
+            "light that is scattered may be occluded" if segments > 2 else "glossy surfaces, or an environment",
+            still if shading is None else "diffuse surfaces in direct light: found from the lights",
+        )
+        meshes = zip(self._geometry.meshes, boundaries.moving, strict=False)
+        return Plan(
+            integrator=self.name,
+            moving=names(m for m, moves in meshes if moves),
+            camera_moves=boundaries.camera_moves,
+            lights_move=film is not None and self._lights_move(boundaries.moving),
+            edges=len(self._edges),
+            tree=shading.tree.leaf_offsets[-1] if shading is not None else 0,
+            terms=tuple(terms),
+            limits=boundaries.limits,
+        )
+
     # ---------------------- What moves ----------------------
 
     def find_boundaries(self, scene, sensor=0) -> Boundaries | None:
@@ -341,15 +408,15 @@ class EdgeIntegrator(ADIntegrator):
 
         Returns
         -------
-        What a frozen function depends on (a PyTree), or None where nothing moves.
+        What a frozen function depends on (a PyTree).
         """
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         with dr.suspend_grad():
             return self._boundaries_of(scene, sensor, self._override(self.sppi, 0, sensor))
 
-    def _boundaries_of(self, scene, sensor, sppi) -> Boundaries | None:
-        """The edges that can contribute, or None where nothing moves."""
+    def _boundaries_of(self, scene, sensor, sppi) -> Boundaries:
+        """The edges that can contribute."""
         geometry = Geometry.of(scene)
         if self._geometry is None or self._geometry.key() != geometry.key():
             self._refuse_while_recording()
@@ -372,16 +439,21 @@ class EdgeIntegrator(ADIntegrator):
         if light_moves and sppi > 0:
             self._warn_once(HARD_SHADOWS)
         if not camera_moves and not any(moving):
-            return None
-        key = (moving, camera_moves)
+            return Boundaries()
+        key = (moving, camera_moves, sppi > 0)
         if key not in self._boundaries:
             self._refuse_while_recording()
-            self._warn_of_limits(scene, sppi)
+            limits = self._limits(scene, moving, camera_moves, sppi)
+            for limit in limits:
+                self._warn_once(limit)
             on_film = tuple(m or camera_moves for m in moving)
             edges = self._edges.of_meshes(np.array(on_film))
             self._boundaries[key] = Boundaries(
                 FilmBoundary(geometry, edges, geometry.faces(on_film)),
-                self._shading_boundary(scene, moving, camera_moves),
+                self._shading_boundary(scene, moving, camera_moves) if sppi > 0 else None,
+                moving,
+                camera_moves,
+                limits,
             )
         return self._boundaries[key]
 
@@ -395,28 +467,47 @@ class EdgeIntegrator(ADIntegrator):
     def _shading_boundary(self, scene, moving, camera_moves) -> ShadingBoundary | None:
         if not scene.emitters() or not len(self._edges) or not self.depths.scatters(1):
             return None
-        lights_move = any(m.is_emitter() and moves for m, moves in zip(self._geometry.meshes, moving, strict=True))
-        return ShadingBoundary(
-            scene,
-            self._geometry,
-            self._edges,
-            moving,
-            everything=camera_moves or lights_move,
-        )
+        everything = camera_moves or self._lights_move(moving)
+        return ShadingBoundary(scene, self._geometry, self._edges, moving, everything=everything)
 
-    def _warn_of_limits(self, scene, sppi) -> None:
+    def _looks_from_points(self, shading: ShadingBoundary) -> bool:
+        """Diffuse surfaces in direct light find all that is lit from the lights."""
+        return bool(self.depths.scatters(2)) or shading.emission_from_points
+
+    def _lights_move(self, moving) -> bool:
+        return any(m.is_emitter() and moves for m, moves in zip(self._geometry.meshes, moving, strict=True))
+
+    def _limits(self, scene, moving, camera_moves, sppi) -> tuple[str, ...]:
+        """What the derivative will lack."""
+        limits = []
+        geometry = self._geometry
         if sppi > 0 and any(e.flags() & mi.EmitterFlags.Delta for e in scene.emitters()):
-            self._warn_once(HARD_SHADOWS)
+            limits.append(HARD_SHADOWS)
         if sppi > 0 and any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes()):
-            self._warn_once(
+            limits.append(
                 "the derivative lacks the motion of edges seen in perfect mirrors and glass; "
                 'give them a roughness, or set "sppi" to 0 to accept this.'
             )
         textures = jumping_textures(scene)
         if textures:
-            self._warn_once(
+            limits.append(
                 f"the derivative lacks the jumps of the textures {', '.join(textures)}; use a bilinear bitmap."
             )
+        casts = names(s for s in geometry.others if not s.is_emitter())
+        if sppi > 0 and casts:
+            limits.append(
+                f"the derivative lacks the shadows and reflections of {', '.join(casts)} on what moves, or in light that "
+                "moves: their silhouettes are unknown. Replace them by meshes."
+            )
+        cut = {
+            (geometry.meshes[i].id(), geometry.meshes[j].id())
+            for i, j in intersecting_meshes(scene, geometry, self._edges)
+            if moving[i] or moving[j] or camera_moves
+        }
+        if cut:
+            pairs = ", ".join(f'"{a}" and "{b}"' for a, b in sorted(cut))
+            limits.append(f"the derivative lacks the lines in which meshes cut through each other: {pairs}.")
+        return tuple(limits)
 
     def _warn_once(self, message: str) -> None:
         if message not in self._warned:
@@ -441,6 +532,14 @@ class EdgeIntegrator(ADIntegrator):
         """Width and height of what is sampled, in pixels."""
         border = 2 * film.rfilter().border_size() if film.sample_border() else 0
         return tuple(int(n) + border for n in film.crop_size())
+
+    def _line_samples(self, sensor: mi.Sensor, sppp: int) -> int:
+        """A line covers few pixels: unless a number of samples was asked for, so many a pixel of it are enough."""
+        width, height = self._size(sensor.film())
+        return sppp * (width * height if self.sppp else min(width * height, LINE * (width + height)))
+
+    def _counts(self, spp: int, sensor: mi.Sensor) -> tuple[int, int, int]:
+        return tuple(self._override(own, spp, sensor) for own in (self.sppc, self.sppp, self.sppi))
 
     @staticmethod
     def _sampler(sensor: mi.Sensor, seed: int | mi.UInt32, spp: int) -> tuple[mi.Sampler, int]:

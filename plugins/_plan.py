@@ -1,0 +1,120 @@
+"""What a derivative of a scene needs: which terms, of how many edges, at what cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass(frozen=True)
+class PlannedTerm:
+    """A term of the derivative.
+
+    name : what it is.
+    samples : number in one derivative, 0 if the term is left out.
+    rays : that a sample traces, at most.
+    reason : why it is needed, or not.
+    """
+
+    name: str
+    samples: int
+    rays: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an integrator will do for a derivative. `print` it.
+
+    integrator : its plugin.
+    moving : names of the meshes that move.
+    camera_moves, lights_move : do they?
+    edges : number of edges of all meshes.
+    tree : number of leaves of the tree over the edges, 0 where none is built.
+    terms : of the derivative.
+    limits : what the derivative will lack.
+    """
+
+    integrator: str
+    moving: tuple[str, ...]
+    camera_moves: bool
+    lights_move: bool
+    edges: int
+    tree: int
+    terms: tuple[PlannedTerm, ...]
+    limits: tuple[str, ...] = ()
+
+    def term(self, name: str) -> PlannedTerm:
+        return next(t for t in self.terms if t.name == name)
+
+    @property
+    def rays(self) -> int:
+        """Rays of one derivative, at most."""
+        return sum(t.samples * t.rays for t in self.terms)
+
+    def __str__(self) -> str:
+        moves = [*self.moving, *(["the camera"] if self.camera_moves else [])]
+        lines = [
+            f"{self.integrator}: {', '.join(moves) or 'nothing'} move{'s' if len(moves) < 2 else ''}"
+            + (", lights among them" if self.lights_move else ""),
+            f"{self.edges} edges; " + (f"tree of {self.tree} leaves" if self.tree else "no tree"),
+        ]
+        width = max(len(t.name) for t in self.terms)
+        for t in self.terms:
+            cost = f"{t.samples:>12,} samples of up to {t.rays:>3} rays" if t.samples else f"{'left out':>37}"
+            lines.append(f"  {t.name:<{width}} {cost:<37}  {t.reason}")
+        lines.append(f"up to {self.rays:,} rays")
+        return "\n".join(lines + [f"Lacking: {limit}" for limit in self.limits])
+
+
+def plan(
+    scene: mi.Scene,
+    params: mi.SceneParameters | Iterable[str] | None = None,
+    *,
+    integrator: mi.Integrator | None = None,
+    sensor: int = 0,
+    spp: int = 0,
+) -> Plan:
+    """What a derivative of this scene with respect to these parameters needs. The integrators follow the same plan.
+
+    Parameters
+    ----------
+    params : parameters some of which carry gradients, or names of parameters that will. Default: what carries a
+        gradient now.
+    integrator : `direct_edge` or `prb_edge`. Default: the scene's own if it is one of these, or else `prb_edge`.
+    spp : samples per pixel. Default: as the integrator and the sampler have it.
+
+    Raises
+    ------
+    ValueError : a name is unknown, or the integrator is another one.
+    RuntimeError : the derivative is refused, as it would be when rendering.
+    """
+    integrator = integrator or scene.integrator()
+    if not hasattr(integrator, "plan"):
+        integrator = mi.load_dict({"type": "prb_edge"})
+    if params is None or isinstance(params, mi.SceneParameters):
+        return integrator.plan(scene, sensor, spp)
+    keys, known = list(params), mi.traverse(scene)
+    unknown = [k for k in keys if k not in known]
+    if unknown:
+        raise ValueError(f"plan: unknown parameter {', '.join(unknown)}")
+    before = {k: known[k] for k in keys}
+    try:
+        for k in keys:
+            known[k] = type(before[k])(dr.detach(before[k]))
+            dr.enable_grad(known[k])
+        known.update()
+        return integrator.plan(scene, sensor, spp)
+    finally:
+        for k, value in before.items():
+            known[k] = value
+        known.update()
+
+
+def names(shapes: Iterable[Any]) -> tuple[str, ...]:
+    """Names of shapes, for messages."""
+    return tuple(f'"{s.id()}"' for s in shapes)
