@@ -54,12 +54,12 @@ class EdgeSample:
 
 
 def sample_edge(
-    tree: EdgeTree, view: View, sampler: mi.Sampler, use: list[mi.Bool | bool], *, from_light: bool, active: mi.Bool
+    tree: EdgeTree, view: View, sampler: mi.Sampler, use: list[mi.Float | float], *, from_light: bool, active: mi.Bool
 ) -> EdgeSample:
     """Descend the tree at random, in proportion to the importance of the children of each node; test the edges of the
     leaf one by one; choose a point on one.
 
-    use : for each group of edges of the tree, whether to choose from it.
+    use : for each group of edges of the tree, how much to prefer it; 0: do not choose from it.
     from_light : the importance of an edge falls off with the square of its distance, not with the distance itself.
 
     Returns
@@ -72,12 +72,13 @@ def sample_edge(
 
     # ---------------------- Which group ----------------------
 
+    # One random number serves for the group, the edge and the point: what is left of it after each choice is uniform.
     total, choice = mi.Float(0), mi.Float(sampler.next_1d(active))
-    for k, wanted in enumerate(use):
-        weight = mi.Float(1)
-        if len(use) > 1:
-            root = tree.node(mi.UInt32(tree.node_offsets[k] + 1))
-            weight = dr.select(wanted, importance(root, view, from_light), 0)
+    for k, preference in enumerate(use):
+        weight = mi.Float(preference)
+        # A few edges are tested faster than their node.
+        if len(use) > 1 and max(tree.depths) > 0:
+            weight *= importance(tree.node(mi.UInt32(tree.node_offsets[k] + 1)), view, from_light)
         total += weight
         p = dr.select(total > 0, weight / total, 0)
         taken = choice < p
@@ -108,7 +109,6 @@ def sample_edge(
     # ---------------------- The edges of the leaf ----------------------
 
     first = (node - bottom + leaf_offset) * LEAF
-    choice = sampler.next_1d(alive)
 
     def test(k, total, chosen, weight, choice):
         slot = tree.slot(first + k, alive)
@@ -120,12 +120,16 @@ def sample_edge(
         return k + 1, total, dr.select(taken, k, chosen), dr.select(taken, w, weight), choice
 
     state = (dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width), dr.zeros(mi.UInt32, width))
-    _, total, chosen, weight, _ = dr.while_loop(
-        (*state, dr.zeros(mi.Float, width), choice), lambda k, *_: alive & (k < LEAF), test, label="edges of a leaf"
+    _, total, chosen, weight, choice = dr.while_loop(
+        (*state, dr.zeros(mi.Float, width), choice),
+        lambda k, *_: alive & (k < tree.leaf_size),
+        test,
+        label="edges of a leaf",
     )
     alive &= total > 0
     slot = first + chosen
-    t, pdf = _sample_point(tree.slot(slot, alive), view, from_light, sampler.next_1d(alive), sampler.next_1d(alive))
+    which = sampler.next_1d(alive) if view.lobes else mi.Float(0)
+    t, pdf = _sample_point(tree.slot(slot, alive), view, which, choice)
     density = dr.select(alive, density * weight / total * pdf, 0)
     return EdgeSample(dr.gather(mi.UInt32, tree.slot_edge, slot, alive), t, dr.select(dr.isfinite(density), density, 0))
 
@@ -179,14 +183,31 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     """What `importance` is for a node, for a single edge. Zero where that is no boundary."""
     y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -1)
     signs = [dr.dot(q, y) for q in slot.planes]
-    edge_on = EDGE_ON * dr.norm(slot.a - view.p)
-    silhouette = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
-    result = dr.select(silhouette, sum(d.total for d in _on_line(slot, view, from_light)), 0)
+    a, b = slot.a - view.p, slot.b - view.p
+    length_a, length_b = dr.norm(a), dr.norm(b)
+    edge_on = EDGE_ON * length_a
+    boundary = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
+    above = [dr.dot(view.n, v) for v in (a, b)]
+    everywhere = dr.all(view.n == 0)
+    boundary &= (above[0] > EDGE_ON * length_a) | (above[1] > EDGE_ON * length_b) | everywhere
+    product = length_a * length_b
+    across = dr.norm(dr.cross(a, b))
+    # Twice the tangent of half the angle under which the edge is seen: near enough to the angle, but for large ones.
+    angle = dr.minimum(2 * across / (product + dr.dot(a, b)), dr.pi)
+    cosine = dr.clip(0.5 * (above[0] / length_a + above[1] / length_b), 0, 1) + _MARGIN[from_light]
+    result = view.wide * angle * dr.select(everywhere, 1, cosine)
+    for lobe in view.lobes:
+        e = slot.b - slot.a
+        length = dr.norm(e)
+        result += _narrow(lobe, a, e / length, length, across / length).total
     if from_light:
-        result *= dr.rsqrt(dr.squared_norm(0.5 * (slot.a + slot.b) - view.p) + dr.squared_norm(slot.b - slot.a) / 12)
-    ends = [dr.dot(view.n, v - view.p) > EDGE_ON * dr.norm(v - view.p) for v in (slot.a, slot.b)]
-    above = ends[0] | ends[1] | dr.all(view.n == 0)
-    return dr.select(above & (dr.squared_norm(slot.b - slot.a) > 0) & dr.isfinite(result), result, 0)
+        result *= dr.rsqrt(product)
+    return dr.select(boundary & (across > 0) & dr.isfinite(result), result, 0)
+
+
+#: Added to the cosine of an edge, by whether a light looks: it stands for all of the edge, and the normal at a shading
+#: point may be that of the face, not of the shading.
+_MARGIN = {False: 0.05, True: 0.02}
 
 
 def _quadratic(y):
@@ -243,7 +264,7 @@ class _Narrow:
         return _falloff(x * x) / (self.a * self.extent)
 
 
-def _on_line(slot: Slot, view: View, from_light: bool) -> list[_Wide | _Narrow]:
+def _on_line(slot: Slot, view: View) -> list[_Wide | _Narrow]:
     """Densities on an edge, by length along it, with their weights: that of all directions, and of each lobe."""
     a, e = slot.a - view.p, slot.b - slot.a
     length = dr.norm(e)
@@ -254,11 +275,8 @@ def _on_line(slot: Slot, view: View, from_light: bool) -> list[_Wide | _Narrow]:
     start = dr.atan2(-foot, h)
     angle = dr.maximum(dr.atan2(length - foot, h) - start, 1e-7)
     middle = dr.normalize(a + 0.5 * length * e)
-    # The cosine at the middle stands for all of the edge, and n may be that of the face, not of the shading.
-    margin = 0.02 if from_light else 0.05
-    cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(dr.dot(view.n, middle), 0, 1) + margin)
+    cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(dr.dot(view.n, middle), 0, 1) + _MARGIN[False])
     wide = _Wide(foot, h, start, angle, view.wide * cosine * angle)
-
     return [wide, *(_narrow(lobe, a, e, length, h) for lobe in view.lobes)]
 
 
@@ -281,10 +299,10 @@ def _narrow(lobe: Lobe, a: mi.Vector3f, e: mi.Vector3f, length: mi.Float, h: mi.
     return _Narrow(closest, k, start, extent, dr.select(dr.isfinite(total), total, 0))
 
 
-def _sample_point(slot: Slot, view: View, from_light: bool, choice: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Float]:
+def _sample_point(slot: Slot, view: View, choice: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Parameter t of a point on the edge, and its density."""
     length = dr.norm(slot.b - slot.a)
-    densities = _on_line(slot, view, from_light)
+    densities = _on_line(slot, view)
     total = sum(d.total for d in densities)
     s, below = densities[0].sample(u), densities[0].total
     for d in densities[1:]:

@@ -104,7 +104,7 @@ class EdgeTree:
     groups : indices into `edges`, a tree for each; without the empty ones.
     """
 
-    _NUMBERS = ("depths", "node_offsets", "leaf_offsets")
+    _NUMBERS = ("leaf_size", "depths", "node_offsets", "leaf_offsets")
     DRJIT_STRUCT = dict.fromkeys(  # for `dr.freeze`
         ("device_edges", "centre", "slot_edge", "_used", "_open", "nodes", "slots", *_NUMBERS)
     )
@@ -116,12 +116,13 @@ class EdgeTree:
         ends = position[edges.vertices[:, 0]]
         centres = np.where(np.isfinite(ends), ends, 0).mean(1)
         self.centre = mi.Point3f(*map(float, np.median(centres, axis=0)))
-        slots, self.depths = [], []
+        slots, self.depths, self.leaf_size = [], [], 0
         self.node_offsets, self.leaf_offsets = [0], [0]
         for group in groups:
             order = _order(centres[group])
             slots.append(np.where(order < 0, -1, group[order]))
             leaves = len(order)
+            self.leaf_size = max(self.leaf_size, int((order >= 0).sum(1).max()))
             self.depths.append(leaves.bit_length() - 1)
             self.node_offsets.append(self.node_offsets[-1] + 2 * leaves)
             self.leaf_offsets.append(self.leaf_offsets[-1] + leaves)

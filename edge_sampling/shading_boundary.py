@@ -135,9 +135,9 @@ class ShadingBoundary:
                 dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), dr.inv_pi, 0.1 * dr.inv_pi),
                 self._lobes(scene, si, bsdf, sampler, active, scattered is not None),
             )
-            use = [True, moves] if len(self.groups) == 2 else [True]
+            use = [1, dr.select(moves, 1, 0)] if len(self.groups) == 2 else [1]
             e = sample_edge(self.tree, view, sampler, use, from_light=False, active=active)
-        weight = lambda a, b: dr.select(share_emission, _share(b, a), 1)
+        weight = (lambda a, b: dr.select(share_emission, _share(b, a), 1)) if self.from_lights_possible else None
         return self._evaluate(scene, si, e, sampler, active, weight, emission=emission, scattered=scattered)
 
     def _lobes(self, scene, si, bsdf, sampler, active, towards_lights: bool) -> list[Lobe]:
@@ -183,7 +183,7 @@ class ShadingBoundary:
             # ---------------------- A point on a light ----------------------
 
             lights = dr.width(self.surface_lights)
-            which = dr.minimum(mi.UInt32(sampler.next_1d() * lights), lights - 1)
+            which = dr.minimum(mi.UInt32(sampler.next_1d() * lights), lights - 1) if lights > 1 else mi.UInt32(0)
             emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.surface_lights, which))
             time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
             y, _ = emitter.sample_position(time, sampler.next_2d())
@@ -192,7 +192,9 @@ class ShadingBoundary:
             # ---------------------- An edge as seen from there ----------------------
 
             view = View(mi.Vector3f(y.p - self.tree.centre), y.n, dr.full(mi.Float, 1, count), [])
-            e = sample_edge(self.tree, view, sampler, [True] * len(self.groups), from_light=True, active=active)
+            # Shadows of edges that stand still matter only on what moves.
+            use = [1, 0.2][: len(self.groups)]
+            e = sample_edge(self.tree, view, sampler, use, from_light=True, active=active)
             active &= e.density > 0
             positions = dr.detach(self.geometry.positions())
             a, b = self.tree.device_edges.end_points(positions, e.edge)
@@ -209,7 +211,15 @@ class ShadingBoundary:
             shadow = mi.Ray3f(mi.Point3f(p + outward * offset * across), ω, time, [])
             pi = scene.ray_intersect_preliminary(shadow, active=active)
             active &= pi.is_valid()
-            x = shadow(pi.t)
+            # A ray towards the light will start above the surface: from where it starts, it must meet the edge.
+            hit = pi.compute_surface_interaction(shadow, mi.RayFlags.Minimal, active)
+            facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
+            lift = dr.dot(hit.spawn_ray(-ω).o - hit.p, facing)
+            cos_x = -dr.dot(facing, ω)
+            aside = outward * offset * across
+            along = (lift + dr.dot(aside, facing)) / dr.maximum(cos_x, 0.05)
+            start = mi.Point3f(hit.p - aside - ω * along)
+            x = mi.Point3f(start - facing * lift)
 
             # ---------------------- Does the sensor see it? ----------------------
 
@@ -237,8 +247,7 @@ class ShadingBoundary:
             # ---------------------- Density ----------------------
 
             # Of the edge point, and of the film position: dA(y) cos θ_y / r_y² = dA(x) cos θ_x / r_x².
-            cos_x = dr.abs_dot(si.n, ω)
-            area = dr.squared_norm(y.p - p) * cos_x / (dr.squared_norm(si.p - p) * cos_y)
+            area = dr.squared_norm(y.p - p) * cos_x / (dr.squared_norm(start - p) * cos_y)
             s, t = mi.coordinate_system(si.n)
             along = [
                 tangent(projection, dr.detach(si.p), mi.Point3f(dr.detach(si.p) + v), mi.Float(0), aperture_sample)
@@ -248,8 +257,8 @@ class ShadingBoundary:
             e.density *= y.pdf / lights * area / dr.detach(pixels) * count
             active &= dr.isfinite(e.density) & (e.density > 0)
 
-        share = lambda a, b: _share(a, b) if self.emission_from_points else mi.Float(1)
-        value = self._evaluate(scene, si, e, sampler, active, share, target=(emitter, dr.norm(y.p - p)))
+        share = _share if self.emission_from_points else None
+        value = self._evaluate(scene, si, e, sampler, active, share, target=(emitter, y))
         with dr.resume_grad():
             return LightSamples(u, value * ray_weight, ray.wavelengths)
 
@@ -262,44 +271,59 @@ class ShadingBoundary:
         sample: EdgeSample,
         sampler: mi.Sampler,
         active: mi.Bool,
-        emission_weight: Callable[[mi.Float, mi.Float], mi.Float],
+        emission_weight: Callable[[mi.Float, mi.Float], mi.Float] | None,
         *,
         emission: mi.Bool | bool = True,
         scattered: Scattered | None = None,
-        target: tuple[mi.EmitterPtr, mi.Float] | None = None,
+        target: tuple[mi.EmitterPtr, mi.PositionSample3f] | None = None,
     ) -> mi.Spectrum:
         """What a point on an edge does to the light that is reflected at `si`.
 
         emission_weight : weight of emitted light, of the densities of its direction by light and by BSDF sampling.
-        target : only this emitter counts, at this distance behind the edge.
+        target : only this emitter counts, at this point of it.
         """
         edges = self.tree.device_edges
         with dr.resume_grad():
             positions = self.geometry.positions()
         with dr.suspend_grad():
             a, b = edges.end_points(positions, sample.edge)
-            x, p = si.p, dr.lerp(a, b, sample.t)
+            p = dr.lerp(a, b, sample.t)
+            # Mitsuba's rays start above the surface: look from there.
+            lift = si.spawn_ray(p - si.p).o - si.p
+            x = mi.Point3f(si.p + lift)
             distance = dr.norm(p - x)
             ω = (p - x) / distance
             n_dl = dr.cross(ω, b - a) / (distance * sample.density)
-            f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
+            seen = ω
+            if target is not None:
+                # `path` reckons the geometry of light samples from the surface itself.
+                d, lifted = target[1].p - si.p, target[1].p - x
+                seen, n = dr.normalize(d), target[1].n
+                ratio = dr.squared_norm(lifted) / dr.squared_norm(d)
+                n_dl *= ratio * dr.sqrt(ratio) * dr.dot(n, d) / dr.dot(n, lifted)
+            f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(seen), active)
             active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
             side = edges.outward(positions, sample.edge, p, across)
             active &= side != 0
             n_dl = dr.select(active, n_dl, 0)
-            # Mitsuba lifts the origin off the surface by more than the offset: aim from there.
-            ray = si.spawn_ray_to(p + side * _offset(p, x) * across)
-            ray.maxt = dr.largest(mi.Float)
+            beside = mi.Point3f(p + side * _offset(p, x) * across)
+            if target is None:
+                ray = si.spawn_ray(dr.normalize(beside - x))
+            else:
+                # From x to the edge, nothing is in the way: that has been seen already.
+                ray = mi.Ray3f(beside, dr.normalize(target[1].p - beside), si.time, si.wavelengths)
             pi = scene.ray_intersect_preliminary(ray, active=active)
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             emitter = y.emitter(scene, active)
             lit = active & emission & (emitter != None)  # noqa: E711 (an array of pointers)
             if target is not None:
-                lit &= (emitter == target[0]) & (dr.abs(pi.t - distance - target[1]) <= 1e-3 * pi.t)
-            on_surface = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-            light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), on_surface)
-            L = emitter.eval(y, lit) * dr.select(on_surface, emission_weight(light_pdf, pdf), 1)
+                lit &= (emitter == target[0]) & (dr.norm(y.p - target[1].p) <= 1e-3 * pi.t)
+            L = emitter.eval(y, lit)
+            if emission_weight is not None:
+                on_surface = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+                light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), on_surface)
+                L *= dr.select(on_surface, emission_weight(light_pdf, pdf), 1)
             valid = active & y.is_valid()
             if scattered is not None:
                 L += dr.select(valid, scattered(ray, pi, sampler, valid), 0)
@@ -310,7 +334,8 @@ class ShadingBoundary:
         with dr.resume_grad():
             a, b = edges.end_points(positions, sample.edge)
             y = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, valid).p
-            velocity = _turning(n_dl, dr.lerp(a, b, sample.t) - si.p, active) - _turning(n_dl, y - si.p, valid)
+            x = si.p + lift
+            velocity = _turning(n_dl, dr.lerp(a, b, sample.t) - x, active) - _turning(n_dl, y - x, valid)
             return -side * L * velocity
 
 
