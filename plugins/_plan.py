@@ -83,8 +83,7 @@ def plan(
 
     Parameters
     ----------
-    params : parameters some of which carry gradients, or names of parameters that will. Default: what carries a
-        gradient now.
+    params : parameters, or names of parameters that will carry gradients. Default: what carries one now.
     integrator : `direct_edge` or `prb_edge`. Default: the scene's own if it is one of these, or else `prb_edge`.
     spp : samples per pixel. Default: as the integrator and the sampler have it.
 

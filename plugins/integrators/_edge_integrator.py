@@ -485,7 +485,7 @@ class EdgeIntegrator(ADIntegrator):
             limits.append(HARD_SHADOWS)
         if sppi > 0 and any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes()):
             limits.append(
-                "the derivative lacks the motion of edges seen in perfect mirrors and glass; "
+                "the derivative lacks the motion of what perfect mirrors and glass show; "
                 'give them a roughness, or set "sppi" to 0 to accept this.'
             )
         textures = jumping_textures(scene)

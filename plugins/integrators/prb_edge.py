@@ -32,7 +32,8 @@ class PRBEdgeIntegrator(EdgeIntegrator):
 
      * - sppp
        - |int|
-       - Samples per pixel of the film boundary (visibility as seen from the sensor); likewise.
+       - Samples per pixel of the film boundary (visibility as seen from the sensor); likewise, but without a number
+         in the scene at most 16 (width + height) for each sample per pixel.
 
      * - sppi
        - |int|
@@ -47,20 +48,16 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     ``max_depth`` 2 the two agree, and ``direct_edge`` is the cheaper one.
 
     **Interior.** The part of a path behind its first vertex is differentiated by path replay (Vicini et al. 2021):
-    memory does not grow with the number of bounces. Three rules say what is held fixed. A surface that scatters is met
-    by a *fixed ray*, wherever it moves. As seen from a vertex that moves, the next one that scatters is *fixed in
-    space*. Of an emitter, the *material point* that emits is fixed, so that a light takes its samples along. So the
-    derivative at one vertex needs no other vertex to move (Worchel et al. 2025).
+    memory does not grow with the number of bounces. All its vertices are *material points*, which follow their surfaces
+    (Zhang et al. 2020); the first is met by a ray that is fixed on the film.
 
     **Boundaries at shading points.** Each path keeps *one* of its vertices, chosen by a reservoir in proportion to
-    throughput, and one edge as seen from there. The light on both sides of the edge is traced to ``max_depth``. Shadows
-    that lights of finite size cast on what the camera sees are found from the lights, too.
+    throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows that
+    lights of finite size cast on what the camera sees are found from the lights.
 
-    **Limits.** Those of ``direct_edge``, but for interreflections. Missing, with a warning: the motion of geometry that
-    perfect mirrors and glass show, at all depths beyond 2 (a rough surface may see it in a mirror, or the camera by way
-    of several), the hard shadows of point, spot and directional lights, and the jumps of textures. Missing, without a
-    warning: the lines in which meshes cut through each other. Polarised variants and participating media are not
-    supported.
+    **Limits.** Those of ``direct_edge``, but for interreflections; what perfect mirrors and glass show is taken not to
+    move, with a warning. In corners of rooms, the derivative with respect to the camera has infinite variance: it is
+    right in the mean, and noisy. Participating media are not supported.
 
     .. tabs::
         .. code-tab:: xml
