@@ -314,6 +314,9 @@ class ShadingBoundary:
                 # From x to the edge, nothing is in the way: that has been seen already.
                 ray = mi.Ray3f(beside, dr.normalize(target[1].p - beside), si.time, si.wavelengths)
             pi = scene.ray_intersect_preliminary(ray, active=active)
+            if target is None:
+                # Something before the edge hides it. (A surface on which it lies may be met just before it.)
+                active &= ~pi.is_valid() | (pi.t >= distance * (1 - 1e-3))
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             emitter = y.emitter(scene, active)
             lit = active & emission & (emitter != None)  # noqa: E711 (an array of pointers)
@@ -328,6 +331,7 @@ class ShadingBoundary:
             if scattered is not None:
                 L += dr.select(valid, scattered(ray, pi, sampler, valid), 0)
             L = dr.select(active, f * L, 0)
+            n_dl = dr.select(active, n_dl, 0)
             if self.everything:
                 dr.eval(L, n_dl)  # as in `FilmBoundary.sample`
 

@@ -496,8 +496,8 @@ class EdgeIntegrator(ADIntegrator):
         casts = names(s for s in geometry.others if not s.is_emitter())
         if sppi > 0 and casts:
             limits.append(
-                f"the derivative lacks the shadows and reflections of {', '.join(casts)} on what moves, or in light that "
-                "moves: their silhouettes are unknown. Replace them by meshes."
+                f"the derivative lacks the shadows and reflections of {', '.join(casts)} on what moves, or in moving "
+                "light: their silhouettes are unknown. Replace them by meshes."
             )
         cut = {
             (geometry.meshes[i].id(), geometry.meshes[j].id())

@@ -43,11 +43,12 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     boundary unless something occludes it.
 
     **Limits.** Only triangle meshes can move: a moving sphere, curve, instance, ... is refused, and so is a camera
-    that moves past one. Missing, with a warning: the hard shadows of point, spot and directional lights, edges seen
-    in perfect mirrors and glass, the jumps of textures (``checkerboard``, ``nearest`` filters), the lines in which
-    meshes cut through each other, and shadows of spheres, curves, ... on what moves. At the outline of a smooth-shaded mesh, the dark
-    fringe of normals that face away is taken as infinitely thin (see the theory), which leaves a bias of the order of
-    its width: about 2 % on a torus of 48 × 24 quads at 32². Polarised variants are refused. With filters other than ``box``, the ratio of sums that makes a pixel has a bias of order 1/spp, as it
+    that moves past one. Missing, with a warning: the hard shadows of point, spot and directional lights, the motion of
+    what perfect mirrors and glass show, the jumps of textures (``checkerboard``, ``nearest`` filters), the lines in
+    which meshes cut through each other, and shadows of spheres, curves, ... on what moves. At the outline of a
+    smooth-shaded mesh, the dark fringe of normals that face away is taken as infinitely thin (see the theory), which
+    leaves a bias of the order of its width: about 2 % on a torus of 48 × 24 quads at 32². Polarised variants are
+    refused. With filters other than ``box``, the ratio of sums that makes a pixel has a bias of order 1/spp, as it
     has in the image.
 
     .. tabs::
