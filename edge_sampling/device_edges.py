@@ -96,8 +96,8 @@ class DeviceEdges:
             boundary |= dr.abs(sign[-1]) <= dr.norm(n) * (radius + 1e-6 * dr.norm(towards))
         boundary |= sign[0] * sign[1] > 0
         if geometry is not None and EdgeKind.FLAT in self._kinds:
-            lengths = dr.squared_norm(normal[0]) * dr.squared_norm(normal[1])
-            folded = dr.squared_norm(dr.cross(normal[0], normal[1])) > COPLANAR**2 * lengths
+            # By unit vectors: products of lengths could overflow in large scenes.
+            folded = dr.norm(dr.cross(dr.normalize(normal[0]), dr.normalize(normal[1]))) > COPLANAR
             boundary |= (kind == int(EdgeKind.FLAT)) & folded
         if geometry is not None and EdgeKind.SPLIT in self._kinds:
             boundary |= (kind == int(EdgeKind.SPLIT)) & (self.normals_differ(geometry.normals(), edge) > COPLANAR)

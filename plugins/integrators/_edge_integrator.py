@@ -176,7 +176,7 @@ class EdgeIntegrator(ADIntegrator):
         replay : None, or what differentiates the rest of the path.
         """
         attached = mode != dr.ADMode.Primal
-        active = mi.Bool(active)
+        active = mi.Bool(active) & (self.depths.max_depth > 0)
         L, rest = mi.Spectrum(0), None
 
         # ---------------------- First hit ----------------------
@@ -185,7 +185,7 @@ class EdgeIntegrator(ADIntegrator):
         pi = self._first_hit(scene, ray, active)
         with dr.resume_grad(when=attached):
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            if not self.hide_emitters and self.depths.max_depth > 0:
+            if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
         if beyond_horizon:
             up_to_horizon(si, ray)

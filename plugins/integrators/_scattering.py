@@ -147,7 +147,8 @@ class Scattering:
         geometry = dr.abs_dot(y.n, ω) / r2
         if self.moving:
             geometry *= self._area(pi, ray, active)
-        return y, ω, geometry / dr.detach(geometry)
+        now = dr.detach(geometry)
+        return y, ω, dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
 
     def _area(self, pi, ray, active):
         """Twice the area of the triangles hit, attached; 1 where they do not move."""

@@ -45,7 +45,7 @@ class PRBEdgeIntegrator(EdgeIntegrator):
        - Hide directly visible emitters. (Default: no)
 
     Renders what ``path`` renders, and differentiates it with respect to what ``direct_edge`` differentiates. At
-    ``max_depth`` 2 the two agree, and ``direct_edge`` is the cheaper one.
+    ``max_depth`` 2 they are the same.
 
     **Interior.** The part of a path behind its first vertex is differentiated by path replay (Vicini et al. 2021):
     memory does not grow with the number of bounces. All its vertices are *material points*, which follow their surfaces

@@ -1,0 +1,443 @@
+"""The tree over the edges: its contents and statistics, and that it samples every boundary as often as it says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cases
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from scipy.stats import chisquare
+
+from rimlight.edge_sampling import Edges, Geometry, find_edges
+from rimlight.edge_sampling.edge_importance import Lobe, View, sample_edge
+from rimlight.edge_sampling.edge_tree import LEAF, EdgeTree
+
+# ---------------------- Meshes and trees ----------------------
+
+
+def bumpy_sphere(points: int, bumps: float = 0.15, normals: bool = True, centre=(0, 0, 0)) -> mi.Mesh:
+    """A closed mesh of radius about 1, with 3 · `points` − 6 edges of about the same length."""
+    i = np.arange(points) + 0.5
+    height, longitude = 1 - 2 * i / points, np.pi * (1 + 5**0.5) * i
+    radius = np.sqrt(1 - height**2)
+    p = np.stack([radius * np.cos(longitude), height, radius * np.sin(longitude)], 1)
+    faces = ConvexHull(p).simplices
+    a, b, c = (p[faces[:, k]] for k in range(3))
+    inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    p *= 1 + bumps * np.sin(5 * p[:, :1] + 1) * np.cos(4 * p[:, 1:2]) * np.cos(6 * p[:, 2:])
+    return cases.mesh("bumpy", p + np.array(centre), faces, normals)
+
+
+def still_life() -> tuple[mi.Mesh, ...]:
+    """Interpolated and flat normals, split vertices, open edges."""
+    return (
+        bumpy_sphere(60, centre=(3, 0.5, 0)),
+        bumpy_sphere(40, 0.4, normals=False, centre=(-3, 0, 1)),
+        cases.split_cube(),
+        cases.quad([-1, 3, 0], [2, 0, 0], [0, 1, 1], "sheet"),
+    )
+
+
+@dataclass
+class Setup:
+    """A tree with what it is over."""
+
+    tree: EdgeTree
+    geometry: Geometry
+    edges: Edges
+
+    def numbers(self, which: str) -> np.ndarray:
+        """Numbers of each of the `nodes` or `slots`."""
+        return np.array(getattr(self.tree, which)).reshape(-1, 40 if which == "nodes" else 16)
+
+    def root(self, group: int = 0) -> dict[str, np.ndarray]:
+        node = self.tree.node(mi.UInt32(self.tree.node_offsets[group] + 1))
+        return {name: np.array(value, float).reshape(-1) for name, value in vars(node).items()}
+
+    def end_points(self) -> tuple[np.ndarray, np.ndarray]:
+        position = self.geometry.host_positions().astype(float)
+        return position[self.edges.vertices[:, 0, 0]], position[self.edges.vertices[:, 0, 1]]
+
+    def planes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Planes (n, d) of the faces on both sides of each edge, relative to the centre of the tree."""
+        position, (a, b) = self.geometry.host_positions().astype(float), self.end_points()
+        planes = []
+        for side, sign in ((0, 1), (1, -1)):
+            n = sign * np.cross(b - a, position[self.edges.opposite[:, side]] - a)
+            n /= np.linalg.norm(n, axis=1, keepdims=True)
+            planes.append(np.concatenate([n, dots(n, a - np.array(self.tree.centre).ravel())[:, None]], 1))
+        return tuple(planes)
+
+    def boundaries(self, p) -> tuple[np.ndarray, np.ndarray]:
+        """Which edges are boundaries as seen from p, and of which rounding may decide."""
+        y = np.append(np.array(p) - np.array(self.tree.centre).ravel(), -1)
+        s, t = (q @ y for q in self.planes())
+        distance = np.linalg.norm(self.end_points()[0] - p, axis=1)
+        return (s * t <= 0) | (self.edges.count != 2), np.minimum(np.abs(s), np.abs(t)) < 1e-5 * distance
+
+
+def tree_over(*meshes: mi.Mesh, groups=lambda edges: [np.arange(len(edges))]) -> Setup:
+    geometry = Geometry(meshes, ())
+    edges = find_edges(geometry)
+    tree = EdgeTree(geometry, edges, groups(edges))
+    tree.refit(geometry.positions())
+    return Setup(tree, geometry, edges)
+
+
+def odd_and_even(edges: Edges) -> list[np.ndarray]:
+    return [np.arange(0, len(edges), 2), np.arange(1, len(edges), 2)]
+
+
+def dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", a, b)
+
+
+def unit(*v: float) -> np.ndarray:
+    return np.array(v) / np.linalg.norm(v)
+
+
+# ---------------------- Contents ----------------------
+
+
+@pytest.mark.parametrize("points", [4, 5, 6, 47, 300])
+@pytest.mark.parametrize("groups", [None, odd_and_even], ids=["one group", "two groups"])
+def test_every_edge_is_in_exactly_one_slot(points, groups):
+    setup = tree_over(bumpy_sphere(points), **({"groups": groups} if groups else {}))
+    slots, edge, offsets = setup.numbers("slots"), np.array(setup.tree.slot_edge), setup.tree.leaf_offsets
+    used = (slots[:, 8:11] != slots[:, 12:15]).any(1)
+    assert len(edge) == offsets[-1] * LEAF
+    assert (np.sort(edge[used]) == np.arange(3 * points - 6)).all()
+    for k, group in enumerate(groups(setup.edges) if groups else []):
+        here = slice(LEAF * offsets[k], LEAF * offsets[k + 1])
+        assert set(edge[here][used[here]]) == set(group)
+
+
+def statistics(setup: Setup, chosen=slice(None)) -> dict[str, np.ndarray]:
+    """What the root of a tree over silhouettes says, in double precision."""
+    c = np.array(setup.tree.centre).ravel()
+    a, b = (v[chosen] - c for v in setup.end_points())
+    planes = [q[chosen] for q in setup.planes()]
+    length = np.linalg.norm(b - a, axis=1)
+    weights = length / length.sum()
+    middle, Δ = (planes[0] + planes[1]) / 2, planes[0] - planes[1]
+    mean = weights @ middle
+    difference = np.einsum("e,ei,ej->ij", weights, Δ, Δ)
+    return {
+        "silhouettes": length.sum(),
+        "always": 0,
+        "lower": np.minimum(a, b).min(0),
+        "upper": np.maximum(a, b).max(0),
+        "mean": mean,
+        "variance": np.einsum("e,ei,ej->ij", weights, middle - mean, middle - mean) + difference / 12,
+        "difference": difference,
+        "plane_lower": np.minimum(*planes).min(0),
+        "plane_upper": np.maximum(*planes).max(0),
+    }
+
+
+def assert_equal(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    for name, value in expected.items():
+        if name in ("variance", "difference"):
+            value = value[np.triu_indices(4)]
+        assert np.allclose(found[name], value, rtol=1e-4, atol=2e-5), name
+
+
+@pytest.mark.parametrize("centre", [(0, 0, 0), (100, -30, 20)])
+def test_root_knows_moments_and_boxes(centre):
+    setup = tree_over(bumpy_sphere(200, centre=centre))
+    assert_equal(setup.root(), statistics(setup))
+
+
+def test_root_of_each_group_knows_its_own():
+    setup = tree_over(bumpy_sphere(200), groups=odd_and_even)
+    for k, group in enumerate(odd_and_even(setup.edges)):
+        assert_equal(setup.root(k), statistics(setup, group))
+
+
+def test_open_edges_count_as_always():
+    setup = tree_over(*still_life())
+    a, b = setup.end_points()
+    length, is_open = np.linalg.norm(b - a, axis=1), setup.edges.open
+    assert is_open.sum() == 4
+    assert setup.root()["always"] == pytest.approx(length[is_open].sum())
+    assert setup.root()["silhouettes"] == pytest.approx(length[~is_open].sum(), rel=1e-5)
+
+
+# ---------------------- Refit ----------------------
+
+
+def moved(setup: Setup) -> mi.Float:
+    p = setup.geometry.host_positions()
+    return mi.Float((p + 0.2 * np.sin(3 * p[:, [1, 2, 0]])).astype(np.float32).ravel())
+
+
+@pytest.mark.parametrize("groups", [None, odd_and_even], ids=["one group", "two groups"])
+def test_refit_leaves_nothing_of_the_former_positions(groups):
+    options = {"groups": groups} if groups else {}
+    refitted, fresh = (tree_over(*still_life(), **options) for _ in range(2))
+    fresh.tree.nodes, fresh.tree.slots = dr.zeros_like(fresh.tree.nodes), dr.zeros_like(fresh.tree.slots)
+    for setup in (refitted, fresh):
+        before = setup.numbers("nodes")
+        setup.tree.refit(moved(setup))
+    for which in ("nodes", "slots"):
+        assert (refitted.numbers(which) == fresh.numbers(which)).all()
+    assert (before != fresh.numbers("nodes")).any()
+
+
+def test_refit_root_equals_that_of_a_tree_built_there():
+    setup = tree_over(bumpy_sphere(200))
+    positions = moved(setup)
+    setup.tree.refit(positions)
+    params = mi.traverse(setup.geometry.meshes[0])
+    params["vertex_positions"] = positions
+    params.update()
+    assert_equal(setup.root(), statistics(setup))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+def test_vertices_that_are_not_finite_spoil_nothing_else(bad):
+    setup = tree_over(bumpy_sphere(100), groups=odd_and_even)
+    p = setup.geometry.host_positions()
+    p[::10] = bad
+    setup.tree.refit(mi.Float(p.ravel()))
+    for name, value in {**setup.root(0), "of the other": np.concatenate(list(setup.root(1).values()))}.items():
+        assert np.isfinite(value).all(), name
+    assert not np.isnan(setup.numbers("nodes")).any()
+    assert np.isfinite(setup.numbers("slots")).all()
+    edge, t, density = draw(setup, (4, 1, 0.5), 20000)
+    assert np.isfinite(density).all() and np.isfinite(t[density > 0]).all()
+    assert np.isfinite(p[setup.edges.vertices[edge[density > 0], 0]]).all()
+    assert (density > 0).mean() > 0.3
+
+
+def test_a_mesh_of_points_has_no_boundaries():
+    setup = tree_over(bumpy_sphere(30))
+    setup.tree.refit(dr.zeros(mi.Float, 90))
+    assert not (draw(setup, (4, 1, 0.5), 1000)[2] > 0).any()
+
+
+# ---------------------- Sampling ----------------------
+
+
+def draw(
+    setup: Setup, p, count: int, *, n=(0, 0, 0), wide: float = 1, lobes=(), use=None, from_light: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges, parameters and densities of samples as seen from p. Lobes are (axis, peak, width)."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, count)
+    # Opaque: all views share one kernel.
+    number = lambda x: dr.opaque(mi.Float, float(x), count)
+    vector = lambda v: mi.Vector3f(*map(number, v))
+    p = vector(p - np.array(setup.tree.centre).ravel())
+    lobes = [Lobe(vector(axis), number(peak), number(width)) for axis, peak, width in lobes]
+    view = View(p, vector(n), number(wide), lobes)
+    use = use or [True] * len(setup.tree.depths)
+    e = sample_edge(setup.tree, view, sampler, use, from_light=from_light, active=mi.Bool(True))
+    dr.eval(e)
+    return np.array(e.edge), np.array(e.t, float), np.array(e.density, float)
+
+
+def above(v: np.ndarray, p, n) -> np.ndarray:
+    return (v - p) @ n > 1e-6 * np.linalg.norm(v - p, axis=1)
+
+
+def assert_unbiased(setup: Setup, p, samples, lanes=slice(None), among=slice(None), n=None) -> None:
+    """The mean of 1 / density is 1 on every boundary: it is the integral of 1 over t."""
+    edge, t, density = (a[lanes] for a in samples)
+    count, size = len(edge), len(setup.edges)
+    hit = density > 0
+    assert np.isfinite(density).all() and ((t >= 0) & (t <= 1))[hit].all()
+    boundary, ambiguous = setup.boundaries(p)
+    wanted = np.zeros(size, bool)
+    wanted[among] = True
+    allowed = (boundary | ambiguous) & wanted
+    if n is not None:
+        a, b = setup.end_points()
+        wanted &= above(a, p, n) | above(b, p, n)
+    wanted &= boundary & ~ambiguous
+    assert allowed[edge[hit]].all()
+
+    hits = np.bincount(edge[hit], minlength=size)[wanted]
+    assert wanted.sum() > 3 and hits.min() >= 20, f"{hits.min()} samples are too few for a test"
+    weight = np.divide(1, density, where=hit, out=np.zeros(count))
+    mean, square = (np.bincount(edge, weight**k, minlength=size)[wanted] / count for k in (1, 2))
+    # The variance that a mean of 1 would have: where few samples hit, their own depends too much on how many.
+    z = (mean - 1) / np.sqrt((square / mean - 1) / count)
+    assert np.abs(z).max() < 4
+    assert np.mean(z**2) < 1 + 4 * np.sqrt(2 / len(z))
+
+
+TOWARDS_IT = unit(-1, 0.2, 0.1)
+LOBE = (unit(1, 0.2, 0.3), 20, 0.01)
+VIEWS = {
+    "far": ("bumpy", (4, 1, 0.5), {}),
+    "far from a light": ("bumpy", (4, 1, 0.5), {"n": TOWARDS_IT, "from_light": True}),
+    "near": ("bumpy", (1.3, 0, 0.2), {}),
+    "near from a light": ("bumpy", (1.3, 0, 0.2), {"n": TOWARDS_IT, "from_light": True}),
+    "near, above a plane": ("bumpy", (1.3, 0, 0.2), {"n": unit(0, 0.3, 1)}),
+    "in the box": ("bumpy", (0.8, 0.8, 0.8), {}),
+    "in the box from a light": ("bumpy", (0.8, 0.8, 0.8), {"n": TOWARDS_IT, "from_light": True}),
+    "lobe": ("bumpy", (-3, 0, -0.5), {"lobes": [LOBE]}),
+    "lobe only": ("bumpy", (-3, 0, -0.5), {"lobes": [(unit(1, 0.2, 0.3), 1, 0.05)], "wide": 0}),
+    "still life": ("still life", (0, 2, -4), {}),
+    "still life from a light": ("still life", (0, 2, -4), {"n": unit(0.2, -0.3, 1), "from_light": True}),
+    "still life, inside of the sphere": ("still life", (3, 0.5, 0.3), {}),
+    "still life, below the sheet": ("still life", (0.2, 3.1, 0.3), {"n": unit(0.2, -1, 0.5)}),
+    "still life, in the cube": ("still life", (0.1, 0, 0), {}),
+    "still life, two lobes": (
+        "still life",
+        (0, 2, -4),
+        {"lobes": [(unit(0, -0.3, 1), 20, 0.01), (unit(0.5, 0, 1), 2, 0.1)], "wide": 3},
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def scenes(variant) -> dict[str, Setup]:
+    return {"bumpy": tree_over(bumpy_sphere(300)), "still life": tree_over(*still_life())}
+
+
+@pytest.mark.parametrize(("scene", "p", "options"), VIEWS.values(), ids=VIEWS)
+def test_every_boundary_is_sampled_as_often_as_its_density_says(scenes, scene, p, options):
+    setup = scenes[scene]
+    assert_unbiased(setup, p, draw(setup, p, 2**20, **options), n=options.get("n"))
+
+
+@pytest.mark.parametrize("from_light", [False, True])
+def test_groups_are_sampled_where_they_are_wanted(from_light):
+    """The second group only by every other sample."""
+    first = len(find_edges(Geometry(still_life()[:1], ())))
+    setup = tree_over(*still_life(), groups=lambda edges: [np.arange(first, len(edges)), np.arange(first)])
+    count, p = 2**19, (-0.5, 2, -4)
+    both = np.arange(count) % 2 == 0
+    samples = draw(setup, p, count, use=[True, mi.Bool(both)], from_light=from_light)
+    assert_unbiased(setup, p, samples, both)
+    assert_unbiased(setup, p, samples, ~both, slice(first, None))
+
+
+def test_what_is_behind_the_plane_is_not_sampled(scenes):
+    assert not (draw(scenes["bumpy"], (4, 1, 0.5), 1000, n=unit(1, 0, 0))[2] > 0).any()
+
+
+# ---------------------- Frequencies ----------------------
+
+
+def chi_squared(edge: np.ndarray, t: np.ndarray, density: np.ndarray, bins: int = 16) -> float:
+    """p-value of the samples, counted by edge and by intervals of t, with what the density promises. The density is a
+    function of edge and t: the samples tabulate it."""
+    hit = density > 0
+    observed, expected = [], []
+    for e in np.unique(edge[hit]):
+        of_edge = np.flatnonzero(hit & (edge == e))
+        if len(of_edge) < 50 * bins:
+            continue
+        of_edge = of_edge[np.argsort(t[of_edge])]
+        at = np.concatenate([[0], t[of_edge], [1]])
+        value = np.pad(density[of_edge], 1, mode="edge")
+        cumulative = np.concatenate([[0], np.cumsum(np.diff(at) * (value[1:] + value[:-1]) / 2)])
+        # Intervals of equal probability.
+        limits = np.interp(np.linspace(0, cumulative[-1], bins + 1)[1:-1], cumulative, at)
+        observed += list(np.bincount(np.searchsorted(limits, t[of_edge]), minlength=bins))
+        expected += [len(edge) * cumulative[-1] / bins] * bins
+    rest = len(edge) - sum(observed), len(edge) - sum(expected)
+    if rest[0] >= 20:
+        observed.append(rest[0])
+        expected.append(rest[1])
+    assert len(observed) > bins
+    expected = np.array(expected) * (sum(observed) / sum(expected)) if rest[0] < 20 else expected
+    return chisquare(observed, expected).pvalue
+
+
+FREQUENCIES = {
+    "far": ("bumpy", (4, 1, 0.5), {}),
+    "near from a light": ("bumpy", (1.3, 0, 0.2), {"n": TOWARDS_IT, "from_light": True}),
+    "all around": ("still life", (0.2, 3.1, 0.3), {}),
+    "narrow lobe": ("bumpy", (1.3, 0, 0.2), {"lobes": [(unit(-0.3, 0.9, 0.15), 3000, 0.01)]}),
+    "narrow lobe beside an edge": ("still life", (0, 2, -4), {"lobes": [(unit(0.05, 1.2, 4), 3000, 0.01)]}),
+    "narrow lobe only": (
+        "still life",
+        (0.1, 1, 0.4),
+        {"lobes": [(unit(-0.05, 2, 0), 3000, 0.01)], "wide": 0, "n": unit(0, 1, 0)},
+    ),
+    "narrow lobe along an edge": ("still life", (-4, 3.02, 0.02), {"lobes": [(unit(1, -0.002, 0), 3000, 0.01)]}),
+    "two lobes": (
+        "still life",
+        (0, 2, -4),
+        {"lobes": [(unit(0.05, 1.2, 4), 3000, 0.01), (unit(-0.8, -0.4, 1), 30, 0.1)], "wide": 0.1},
+    ),
+}
+
+
+@pytest.mark.parametrize(("scene", "p", "options"), FREQUENCIES.values(), ids=FREQUENCIES)
+def test_frequencies_of_edges_and_points_are_as_reported(scenes, scene, p, options):
+    assert chi_squared(*draw(scenes[scene], p, 2**19, **options)) > 1e-4
+
+
+@pytest.mark.parametrize(
+    "wrong", [lambda t: t**1.03, lambda t: 0.99 * t, lambda t: t], ids=["skewed", "short", "right"]
+)
+def test_chi_squared_notices_wrong_points(scenes, wrong):
+    edge, t, density = draw(scenes["bumpy"], (4, 1, 0.5), 2**19)
+    assert (chi_squared(edge, wrong(t), density) > 1e-4) == (wrong(0.5) == 0.5)
+
+
+def test_chi_squared_notices_wrong_probabilities(scenes):
+    edge, t, density = draw(scenes["bumpy"], (4, 1, 0.5), 2**19)
+    assert chi_squared(edge, t, density * np.where(edge % 2 == 0, 1.05, 0.95)) < 1e-4
+
+
+# ---------------------- Efficiency ----------------------
+
+
+def second_moment(setup: Setup, distance: float, points: int = 18, count: int = 20000) -> float:
+    """Of length / distance over the silhouettes, relative to the square of the mean; 1 is perfect. Mean over points at
+    `distance`, in radii of the mesh."""
+    a, b = setup.end_points()
+    vertices = setup.geometry.host_positions().astype(float)
+    centre = vertices.mean(0)
+    radius = np.linalg.norm(vertices - centre, axis=1).max()
+    length = np.linalg.norm(b - a, axis=1)
+    rng, moments, totals = np.random.default_rng(0), [], []
+    for _ in range(points):
+        p = centre + unit(*rng.normal(size=3)) * radius * distance
+        edge, t, density = draw(setup, p, count)
+        hit = density > 0
+        at = a[edge] + t[:, None] * (b - a)[edge]
+        weight = np.zeros(count)
+        weight[hit] = (length[edge] / np.linalg.norm(at - p, axis=1))[hit] / density[hit]
+        truth = (length / np.linalg.norm((a + b) / 2 - p, axis=1))[setup.boundaries(p)[0]].sum()
+        totals.append(weight.mean() / truth)
+        moments.append((weight**2).mean() / truth**2)
+    assert np.mean(totals) == pytest.approx(1, abs=0.02)
+    return float(np.mean(moments))
+
+
+@pytest.mark.parametrize("distance", [4, 1.15], ids=["far", "near"])
+def test_second_moment_on_a_bumpy_sphere(distance):
+    setup = tree_over(bumpy_sphere(6700, 0.25))
+    moment = second_moment(setup, distance)
+    print(f"{len(setup.edges)} edges, {distance} radii away: second moment {moment:.2f}")
+    assert moment <= 3
+
+
+@pytest.mark.parametrize("distance", [4, 1.15], ids=["far", "near"])
+def test_second_moment_on_a_bunny(shared, distance):
+    file = shared("scenes/redner/bunny_box_bunny.ply")
+    setup = tree_over(mi.load_dict({"type": "ply", "filename": str(file)}))
+    moment = second_moment(setup, distance)
+    print(f"{len(setup.edges)} edges, {distance} radii away: second moment {moment:.2f}")
+    assert moment <= 3
+
+
+def test_memory():
+    """Half-empty leaves included, as with one edge more than the leaves of a power of two hold."""
+    setup = tree_over(bumpy_sphere(33340))
+    assert len(setup.edges) > 100_000
+    assert setup.tree.bytes <= 300 * len(setup.edges)
+    few = 2**13 * LEAF + 1
+    assert EdgeTree(setup.geometry, setup.edges, [np.arange(few)]).bytes <= 300 * few

@@ -1,0 +1,328 @@
+"""Geometry, materials and scales at which arithmetic gives way: nothing may become infinite or NaN, in the image or in
+its derivatives. Where the right answer is known, it must come out, too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cases
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_edge_tree import bumpy_sphere
+
+from rimlight.edge_sampling import Geometry, Motion, ShadingBoundary, derivative_image, find_edges
+
+INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
+SIDE = [1, 0.3, 0.2]
+SPP = 4
+
+
+@pytest.fixture(params=INTEGRATORS)
+def integrator(request) -> Callable[..., mi.Integrator]:
+    return lambda **options: mi.load_dict({**INTEGRATORS[request.param], **options})
+
+
+@pytest.fixture(autouse=True)
+def forget_kernels(free_memory):
+    yield
+    dr.flush_kernel_cache()
+
+
+# ---------------------- Scenes ----------------------
+
+
+def camera(origin=(0.5, 2, -5), target=(0, 0.5, 0), **options) -> dict:
+    return cases.camera(origin, target, film=cases.film(width=16, height=16), **options)
+
+
+def stage(*things: mi.Mesh, sensor=None, **more) -> mi.Scene:
+    """Things on a floor under a light, which `more` may replace."""
+    objects = {
+        "sensor": sensor or camera(),
+        "floor": cases.horizontal((0, 0, 0), 2, "floor", bsdf=cases.diffuse(0.5, two_sided=True)),
+        "light": cases.horizontal(
+            (0.3, 4, 0.2), 0.5, "light", down=True, bsdf=cases.diffuse(0.0), emitter=cases.light(20, 18, 16)
+        ),
+        **{m.id(): m for m in things},
+        **more,
+    }
+    return cases.scene(**{name: o for name, o in objects.items() if o is not None})
+
+
+def thing(vertices, faces, normals: bool = False, bsdf=None) -> mi.Mesh:
+    return cases.mesh("thing", vertices, faces, normals, bsdf=bsdf or cases.diffuse(0.6, 0.5, 0.4, two_sided=True))
+
+
+def cube(bsdf=None) -> mi.Mesh:
+    return thing(0.4 * cases.cube_vertices() + [0.1, 0.9, 0], cases.CUBE_FACES, bsdf=bsdf)
+
+
+QUAD = [[0, 1, 2], [1, 3, 2]]
+ON_AXIS = [[0, 1, -3], [0, 1, 1], [0, 1.7, -3], [0, 1.7, 1]]
+NEEDLES = [[0, 0.5, 0], [1, 0.5, 0], [0.5, 0.5 + 1e-7, 0], [0.5, 1, 0], [0.2, 1, 0.3], [0.2, 1, 0.3], [0, 2, 0]]
+RIM = [[np.cos(a) - 1, 1 + 0.3 * np.sin(3 * a), np.sin(a)] for a in range(5)]
+PARTS = [
+    # A quad that stands on the floor: its lower edge lies in the floor's plane, the lines of two others meet the floor.
+    ([[-0.5, 0, 0], [0.5, 0, 0], [-0.5, 1, 0], [0.5, 1, 0]], QUAD),
+    # One with edges along the view, or parallel to it.
+    (ON_AXIS, QUAD),
+    # Needles, triangles without area, or with a vertex or all of them named twice.
+    (NEEDLES, [[0, 1, 2], [0, 1, 3], [0, 1, 3], [3, 4, 5], [3, 4, 6], [2, 3, 6], [0, 0, 4], [6, 1, 1]]),
+    ([[0, 0.5, 0.1], [1, 0.5, 0.1], [2, 0.5, 0.1]], [[0, 1, 2]]),
+    # Five faces on one edge.
+    ([[-1, 0.2, 0], [-1, 1.5, 0], *RIM], [[0, 1, k] for k in range(2, 7)]),
+    # Two sheets through each other and through the floor.
+    ([[-0.8, -0.3, 0.4], [0.8, -0.3, 0.4], [-0.8, 1, 0.4], [0.8, 1, 0.4]], QUAD),
+    ([[0.3, -0.2, -0.8], [0.3, -0.2, 0.8], [0.3, 1.2, -0.8], [0.3, 1.2, 0.8]], QUAD),
+]
+
+
+def hard_meshes(sensor=None) -> mi.Scene:
+    vertices, faces = [], []
+    for v, f in PARTS:
+        faces += (np.array(f) + len(vertices)).tolist()
+        vertices += v
+    return stage(thing(vertices, faces), sensor=sensor)
+
+
+def lamp(origin, u, v) -> mi.Mesh:
+    return cases.quad(origin, u, v, "light", bsdf=cases.diffuse(0.0), emitter=cases.light(5, 5, 5))
+
+
+def light_in_the_floor() -> mi.Scene:
+    return stage(cube(), light=lamp([-0.5, 0, -1], [0, 0, 0.5], [1, 0, 0]))
+
+
+def light_on_the_floor() -> mi.Scene:
+    return stage(cube(), light=lamp([-0.5, 0, 1], [0, 0.5, 0], [1, 0, 0]))
+
+
+def light_in_view() -> mi.Scene:
+    """It reflects, and to rounding its points see each other: exactly edge-on."""
+    lamp = {"bsdf": cases.diffuse(0.5), "emitter": cases.light(20, 18, 16)}
+    light = cases.horizontal((0.3, 3.9, 0.2), 1, "light", down=True, **lamp)
+    return stage(cube(), sensor=camera((0.3, 2, 0), (0.3, 3.9, 0.2)), light=light)
+
+
+def black() -> mi.Scene:
+    none = cases.diffuse(0.0, two_sided=True)
+    floor = cases.horizontal((0, 0, 0), 2, "floor", bsdf=none)
+    return stage(cube(none), sensor=camera((0.5, 1.5, -3)), floor=floor)
+
+
+def grazing() -> mi.Scene:
+    """A torus with interpolated normals, seen along its top; one sphere in front of the light, one on the floor."""
+    torus = cases.torus("thing", bsdf=cases.diffuse(0.6, two_sided=True))
+    ball = lambda centre, radius: {"type": "sphere", "center": centre, "radius": radius, "bsdf": cases.diffuse(0.6)}
+    sensor = camera((0, 0.46, -4), (0, 0.44, 0))
+    return stage(torus, sensor=sensor, occluder=ball([0.3, 2.5, 0], 0.4), receiver=ball([-0.9, 0.5, 0.5], 0.5))
+
+
+def glossy() -> mi.Scene:
+    """Rough glass above what is almost a mirror, under a light with a texture."""
+    texels = np.random.default_rng(0).uniform(0, 20, (4, 4, 3)).astype(np.float32)
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": "bilinear"}
+    light = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0.3, 4, 0.2]).rotate([1, 0, 0], 90),
+        "emitter": {"type": "area", "radiance": radiance},
+    }
+    mirror = {"type": "roughconductor", "alpha": 1e-4}
+    glass = {"type": "roughdielectric", "alpha": 0.1}
+    return stage(cube(glass), light=light, floor=cases.horizontal((0, 0, 0), 2, "floor", bsdf=mirror))
+
+
+def sky() -> mi.Scene:
+    """A picture of the surroundings, with a small sun."""
+    texels = np.random.default_rng(0).uniform(0, 2, (4, 8, 3)).astype(np.float32)
+    texels[1, 3] = 100
+    return stage(cube(), light=None, environment={"type": "envmap", "bitmap": mi.Bitmap(texels)})
+
+
+@dataclass(frozen=True)
+class Hard:
+    scene: Callable[[], mi.Scene]
+    key: str = "thing.vertex_positions"
+    motion: dict = field(default_factory=lambda: {"direction": SIDE})
+
+
+HARD = {
+    "meshes": Hard(hard_meshes),
+    "meshes, one point of an edge": Hard(lambda: hard_meshes(camera(target=(0.5, 0, 0), fov=1e-3))),
+    "meshes, along an edge": Hard(lambda: hard_meshes(camera((0, 1, -5), (0, 1, 0)))),
+    "meshes, moving camera": Hard(hard_meshes, "sensor.to_world", {"rotate": [0.1, 1, 0.2]}),
+    "light in the floor": Hard(light_in_the_floor, "light.vertex_positions"),
+    "light on the floor": Hard(light_on_the_floor, "light.vertex_positions"),
+    "light in view": Hard(light_in_view, "light.vertex_positions"),
+    "light in view, brighter": Hard(light_in_view, "light.emitter.radiance.value", {"direction": [1, 0.5, 0.2]}),
+    "black": Hard(black),
+    "grazing, past spheres": Hard(grazing),
+    "glossy": Hard(glossy),
+    "sky": Hard(sky),
+    "no light": Hard(lambda: stage(cube(), light=None)),
+}
+
+
+# ---------------------- Finite, and the same both ways ----------------------
+
+
+def jacobian_times(scene, integrator, motion, seed=0, spp=SPP) -> np.ndarray:
+    return np.array(derivative_image(scene, integrator, motion, spp=spp, seed=seed), float)
+
+
+def gradient(scene, integrator, motion, weights) -> float:
+    """dθ of Σ weights · image, through backward mode."""
+    theta = mi.Float(0)
+    dr.enable_grad(theta)
+    motion.apply(theta)
+    value = motion.params[motion.key]
+    integrator.render_backward(scene, motion.params, mi.TensorXf(weights), seed=0, spp=SPP)
+    dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)
+    motion.apply(0.0)
+    return dr.grad(theta)[0]
+
+
+@pytest.mark.parametrize("hard", HARD.values(), ids=HARD)
+def test_image_and_derivatives_are_finite(hard, integrator):
+    scene = hard.scene()
+    motion = Motion(scene, hard.key, **hard.motion)
+    assert np.isfinite(np.array(mi.render(scene, integrator=integrator(), spp=SPP))).all()
+    J = jacobian_times(scene, integrator(), motion)
+    assert np.isfinite(J).all()
+    weights = np.random.default_rng(0).uniform(0.5, 1, J.shape).astype(np.float32)
+    assert gradient(scene, integrator(), motion, weights) == pytest.approx(
+        (weights * J).sum(), abs=1e-3 * np.abs(J).sum() + 1e-5
+    )
+
+
+def test_points_on_the_lines_of_edges():
+    """Shading points on an edge, on its end, on its line, and with the edge in their tangent plane."""
+    scene = stage(thing(*PARTS[0]), light=None, environment=cases.constant())
+    motion = Motion(scene, "thing.vertex_positions", direction=SIDE)
+    theta = mi.Float(0)
+    dr.enable_grad(theta)
+    motion.apply(theta)
+    dr.forward(theta, dr.ADFlag.ClearEdges)
+    geometry = Geometry.of(scene)
+    shading = ShadingBoundary(scene, geometry, find_edges(geometry), geometry.moving(), everything=True)
+    shading.refit()
+    x, z, count = [-0.5, 0.5, 0, 0.25, 0.7, -2, 0.5, 0.1], [0, 0, 0, 0, 0, 0, -0.25, -0.25], 256
+    target = mi.Point3f(dr.repeat(mi.Float(x), count), 0, dr.repeat(mi.Float(z), count))
+    d = dr.normalize(mi.Vector3f(0, -2, 1))
+    with dr.suspend_grad():
+        si = scene.ray_intersect(mi.Ray3f(target - 2 * d, d))
+        assert dr.all(dr.norm(si.p - target) < 1e-6)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, len(x) * count)
+    L = shading.from_points(scene, si, sampler, mi.Bool(True), share_emission=False)
+    derivative = np.array(dr.forward_to(L, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
+    assert np.isfinite(derivative).all()
+    seen = (derivative.reshape(3, len(x), count) != 0).any((0, 2))
+    assert seen[-2:].all(), "the test looks at nothing"
+
+
+# ---------------------- Known answers ----------------------
+
+
+def boundaries_only(scene, integrator, motion, spp=64, **options) -> np.ndarray:
+    return jacobian_times(scene, integrator(sppc=0, **options), motion, spp=spp)
+
+
+def test_black_surfaces_have_no_boundaries_at_shading_points(integrator):
+    scene = black()
+    motion = Motion(scene, "thing.vertex_positions", direction=SIDE)
+    assert (boundaries_only(scene, integrator, motion, sppp=0) == 0).all()
+
+
+def glowing_room(normals: bool) -> tuple[mi.Scene, Motion]:
+    """A sphere, as seen from its inside."""
+    room = bumpy_sphere(150, bumps=0)
+    vertices, faces = (np.array(b).reshape(-1, 3) for b in (room.vertex_positions_buffer(), room.faces_buffer()))
+    walls = {"bsdf": cases.diffuse(0.5), "emitter": cases.light(1, 1, 1)}
+    room = cases.mesh("room", vertices, faces[:, ::-1], normals, **walls)
+    scene = cases.scene(sensor=camera((0.3, 0.1, -0.2), (0, 0, 1)), room=room)
+    return scene, Motion(scene, "room.vertex_positions", direction=SIDE)
+
+
+def test_closed_room_has_no_boundaries(integrator):
+    """No edge is in view, from nowhere."""
+    scene, motion = glowing_room(normals=True)
+    assert np.abs(boundaries_only(scene, integrator, motion)).max() < 1e-3
+
+
+def test_closed_room_looks_the_same_from_everywhere(integrator):
+    scene, motion = glowing_room(normals=False)
+    assert_zero(np.array([jacobian_times(scene, integrator(), motion, seed=i, spp=64) for i in range(16)]))
+
+
+def test_white_cube_under_a_white_sky_is_invisible(integrator):
+    scene = cases.scene(sensor=camera((1.5, 2, -3)), thing=cube(cases.diffuse(1.0)), sky=cases.constant())
+    motion = Motion(scene, "thing.vertex_positions", direction=SIDE)
+    assert_zero(np.array([jacobian_times(scene, integrator(), motion, seed=i, spp=64) for i in range(16)]))
+
+
+def assert_zero(images: np.ndarray) -> None:
+    """Of independent runs: in every pixel, and on the whole."""
+    error = images.std(0, ddof=1) / np.sqrt(len(images))
+    assert np.abs(images.mean(0) / np.maximum(error, 1e-4)).max() < 5
+    totals = images.sum((1, 2, 3))
+    assert abs(totals.mean()) < 4 * totals.std(ddof=1) / np.sqrt(len(totals)) + 1e-3
+
+
+# ---------------------- Scale ----------------------
+
+
+def scaled(s: float, **on_floor: dict) -> tuple[mi.Scene, Motion]:
+    """The same scene, s times as large, and the same motion in units of its size."""
+    sensor = camera(s * np.array([0.5, 2, -5]), s * np.array([0, 0.5, 0]), near_clip=0.01 * s, far_clip=1e4 * s)
+    lamp = {"bsdf": cases.diffuse(0.0), "emitter": cases.light(20, 18, 16)}
+    scene = stage(
+        thing(s * (0.4 * cases.cube_vertices() + [0.1, 0.9, 0]), cases.CUBE_FACES),
+        sensor=sensor,
+        floor=cases.horizontal((0, 0, 0), 2 * s, "floor", bsdf=cases.diffuse(0.5, two_sided=True), **on_floor),
+        light=cases.horizontal(s * np.array([0.3, 4, 0.2]), 0.5 * s, "light", down=True, **lamp),
+    )
+    return scene, Motion(scene, "thing.vertex_positions", direction=s * np.array(SIDE))
+
+
+def relative_difference(image: np.ndarray, reference: np.ndarray) -> float:
+    return np.abs(image - reference).sum() / np.abs(reference).sum()
+
+
+def mean_derivative(scene, motion, integrator) -> np.ndarray:
+    return np.mean([jacobian_times(scene, integrator, motion, seed=i, spp=64) for i in range(4)], 0)
+
+
+@pytest.fixture(scope="module")
+def at_unit_scale(variant) -> dict[str, np.ndarray]:
+    return {name: mean_derivative(*scaled(1), mi.load_dict(i)) for name, i in INTEGRATORS.items()}
+
+
+@pytest.mark.parametrize("scale", [1e6, 1 / 64])
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_derivatives_do_not_depend_on_the_scale(at_unit_scale, name, scale):
+    """Equal seeds: what is left is due to Mitsuba's offset of rays from surfaces, which is absolute (1e-4)."""
+    mean = mean_derivative(*scaled(scale), mi.load_dict(INTEGRATORS[name]))
+    assert relative_difference(mean, at_unit_scale[name]) < 0.03
+
+
+@pytest.mark.parametrize("scale", [1e6, 1e-6])
+def test_film_boundary_does_not_depend_on_the_scale(scale):
+    """Directly visible light alone, on which the offset of rays has no influence."""
+    films = []
+    for s in (1, scale):
+        scene, motion = scaled(s, emitter=cases.light(1, 2, 3))
+        films.append(mean_derivative(scene, motion, mi.load_dict({"type": "prb_edge", "max_depth": 1})))
+    assert relative_difference(films[1], films[0]) < 0.01
+
+
+@pytest.mark.parametrize(("name", "scale"), [("direct_edge", 1e-6), ("prb_edge", 1e-6), ("prb_edge", 1e6)])
+def test_extreme_scales_give_finite_derivatives(name, scale):
+    scene, motion = scaled(scale)
+    integrator = mi.load_dict(INTEGRATORS[name])
+    assert np.isfinite(jacobian_times(scene, integrator, motion)).all()
+    assert np.isfinite(gradient(scene, integrator, motion, np.ones((16, 16, 3), np.float32)))
