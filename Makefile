@@ -24,8 +24,10 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
+# All of them take about half an hour; or one: make bench NAME=scaling
+NAME ?= film_boundary soft_shadow glossy global_illumination scaling
 bench: setup
-	$(BIN)/python tests/benchmarks/bm_film_boundary.py
+	for name in $(NAME); do $(BIN)/python tests/benchmarks/bm_$$name.py || exit 1; done
 
 docs: setup
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html

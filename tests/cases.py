@@ -3,6 +3,7 @@ references."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 REFERENCES = Path(__file__).parent / "references"
+SHARED = Path(__file__).parents[2] / "shared" / "data"  # beside the project; not everybody has it
+REDNER = SHARED / "scenes" / "redner.json"
 RES = 32
 
 
@@ -26,7 +29,10 @@ class Case:
     spp, seeds : of the derivative.
     runs : of the finite differences.
     largest_z : above 4 only where the method is known to be biased, and documented to be.
-    integrator : properties of `direct_edge`.
+    noisy : the noise that is expected may alone exceed the tolerance; then one and a half times as much is allowed.
+    integrator : which one is tested, as a dictionary.
+    reference_spp : samples per pixel of each image of the finite differences; a square number.
+    needs : a file outside of the project without which there is no scene.
     """
 
     name: str
@@ -38,7 +44,15 @@ class Case:
     seeds: int = 16
     runs: int = 12
     largest_z: float = 4
-    integrator: dict[str, Any] = field(default_factory=dict)
+    noisy: bool = False
+    integrator: dict[str, Any] = field(default_factory=lambda: {"type": "direct_edge"})
+    reference_spp: int = 16384
+    needs: Path | None = None
+
+    @property
+    def max_depth(self) -> int:
+        """Of the paths, as Mitsuba counts."""
+        return 2 if self.integrator["type"] == "direct_edge" else self.integrator["max_depth"]
 
     @property
     def reference(self) -> Path:
@@ -46,6 +60,10 @@ class Case:
 
 
 # ---------------------- Building blocks ----------------------
+
+
+def prb_edge(max_depth: int) -> dict:
+    return {"type": "prb_edge", "max_depth": max_depth}
 
 
 def film(rfilter: str = "box", **options: Any) -> dict:
@@ -78,15 +96,20 @@ def light(*radiance: float) -> dict:
     return {"type": "area", "radiance": {"type": "rgb", "value": list(radiance)}}
 
 
-def mesh(name: str, vertices, faces, normals: bool = False, **props: dict) -> mi.Mesh:
-    """A mesh from lists; flat-shaded unless `normals`."""
+def mesh(name: str, vertices, faces, normals: bool = False, uv=None, colours=None, **props: dict) -> mi.Mesh:
+    """A mesh from lists; flat-shaded unless `normals`. `uv` and `colours` (`vertex_color`) are given by vertex."""
     p = mi.Properties()
     for key, value in props.items():
         p[key] = mi.load_dict(value)
-    m = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=normals, props=p)
+    has_uv = uv is not None
+    m = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=has_uv, props=p)
+    if colours is not None:
+        m.add_attribute("vertex_color", 3, np.float32(colours).ravel())
     params = mi.traverse(m)
     params["vertex_positions"] = np.float32(vertices).ravel()
     params["faces"] = np.uint32(faces).ravel()
+    if has_uv:
+        params["vertex_texcoords"] = np.float32(uv).ravel()
     params.update()
     m.set_id(name)
     return m
@@ -238,6 +261,172 @@ def near_plane() -> mi.Scene:
     )
 
 
+def quad(origin, u, v, name: str, **props: dict) -> mi.Mesh:
+    """Parallelogram of corner `origin` and sides u, v; its front is where u × v points."""
+    o, u, v = np.array(origin, float), np.array(u, float), np.array(v, float)
+    return mesh(name, [o, o + u, o + v, o + u + v], [[0, 1, 2], [1, 3, 2]], **props)
+
+
+def horizontal(centre, half: float, name: str, down: bool = False, **props: dict) -> mi.Mesh:
+    """Square of half-side `half`."""
+    x, z = [2 * half, 0, 0], [0, 0, 2 * half]
+    return quad(np.add(centre, [-half, 0, -half]), *((x, z) if down else (z, x)), name, **props)
+
+
+def shadow_blocker(
+    sensor: Callable[..., dict] = camera, half_side: float = 0.1, shift=(0, 0, 0)
+) -> Callable[[], mi.Scene]:
+    """Figure 7b of Li et al. 2018: a square above the frame, between a floor and an area light, always equally strong.
+
+    half_side : of the light.
+    shift : of everything.
+    """
+
+    def build() -> mi.Scene:
+        at = list(shift)
+        radiance = 1000 * (0.1 / half_side) ** 2
+        return scene(
+            sensor=sensor(np.add(at, [0, 2, -5]), at),
+            floor=horizontal(at, 2, "floor", bsdf=diffuse(0.5)),
+            blocker=horizontal(np.add(at, [0, 3, 0]), 0.5, "blocker", bsdf=diffuse(0.5)),
+            light=horizontal(
+                np.add(at, [0, 5, 0]),
+                half_side,
+                "light",
+                down=True,
+                bsdf=diffuse(0.0),
+                emitter=light(radiance, radiance, radiance),
+            ),
+        )
+
+    return build
+
+
+def lens_over_blocker(origin, target) -> dict:
+    return camera(origin, target, "thinlens", aperture_radius=0.15, focus_distance=4.5)
+
+
+def conductor(alpha: float) -> dict:
+    return {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": alpha}
+
+
+def glossy_receiver(alpha: float) -> Callable[[], mi.Scene]:
+    """Figure 7c of Li et al. 2018: the frame is filled by a glossy floor. It mirrors a wide light, and in front of it a
+    blocker, which is not in the frame itself and has two slanted sides."""
+
+    def build() -> mi.Scene:
+        blocker = [[0, 1, 0.5], [0.2, 3, 0.5], [0.8, 1, 0.5], [0.8, 3, 0.5]]
+        return scene(
+            sensor=camera((0, 2, -4), (0, -2, 0)),
+            floor=horizontal((0, 0, 0), 4, "floor", bsdf=conductor(alpha)),
+            blocker=mesh("blocker", blocker, [[0, 1, 2], [1, 3, 2]], bsdf=diffuse(0.5)),
+            light=quad([-2, 0, 4], [0, 12, 0], [4, 0, 0], "light", bsdf=diffuse(0.0), emitter=light(0.5, 0.5, 0.5)),
+        )
+
+    return build
+
+
+def near_light() -> mi.Scene:
+    """Figure 9 of Li et al. 2018: a floor under a small light close to it."""
+    return scene(
+        sensor=camera((0, 2.5, -2.5)),
+        floor=horizontal((0.03, 0, 0.02), 0.7, "floor", bsdf=diffuse(0.5)),
+        light=horizontal((0.1, 0.35, 0.15), 0.05, "light", down=True, bsdf=diffuse(0.0), emitter=light(30, 28, 26)),
+    )
+
+
+COLOURS = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+
+
+def coloured_sphere(seam: bool, columns: int = 40, rings: int = 24) -> mi.Mesh:
+    """A ball of smooth colours and interpolated normals. One column of its quads is cut in two coplanar halves.
+
+    seam : the cut is a seam of texture coordinates, with vertices of its own on either side. Shape, colours and normals
+        stay the same, since the faces on the two sides mirror each other.
+    """
+    longitude = np.arange(columns) * 2 * np.pi / columns
+    ring = np.stack([np.cos(longitude), np.sin(longitude)], -1)
+    cut = (ring[:1] + ring[-1:]) / 2
+    ring = np.concatenate([ring, cut, cut])
+    latitude = np.arange(1, rings) * np.pi / rings
+    height = np.broadcast_to(np.cos(latitude), (len(ring), rings - 1))
+    around = np.stack([ring[:, :1] * np.sin(latitude), height, ring[:, 1:] * np.sin(latitude)], -1)
+    p = np.concatenate([[[0, 1, 0], [0, -1, 0]], around.reshape(-1, 3)])
+    u = (np.append(np.arange(columns + 1), -0.5) + 0.5) / columns
+    u[columns] = 1
+    uv = np.stack(np.broadcast_arrays(u[:, None], latitude / np.pi), -1).reshape(-1, 2)
+    uv = np.concatenate([[[0.5, 0], [0.5, 1]], uv])
+    index = 2 + np.arange((columns + 2) * (rings - 1)).reshape(columns + 2, rings - 1)
+    if not seam:
+        p, uv, index[-1] = p[: 1 - rings], None, index[-2]
+    faces = []
+    for i in range(columns + 1):
+        left, right = index[[i, i + 1] if i < columns else [-1, 0]]
+        a, b, c, d = left[:-1], right[:-1], left[1:], right[1:]
+        halves = ([a, b, c], [b, d, c]) if i < columns else ([a, b, d], [a, d, c])
+        faces += [[[0, right[0], left[0]], [left[-1], right[-1], 1]], *(np.stack(h, -1) for h in halves)]
+    colours = 0.5 + 0.4 * np.sin(4 * p + [0, 1, 2])
+    return mesh("sphere", 0.6 * p + [0.1, 1.9, 0.5], np.concatenate(faces), True, uv, colours, bsdf=COLOURS)
+
+
+def mirrored_sphere(seam: bool) -> Callable[[], mi.Scene]:
+    """The frame is filled by a rough mirror, which shows a sphere that is lit from the camera's side."""
+    return lambda: scene(
+        sensor=camera((0, 2, -4), (0, -2, 0)),
+        floor=horizontal((0, 0, 0), 4, "floor", bsdf=conductor(0.05)),
+        sphere=coloured_sphere(seam),
+        light={
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().look_at([-2, 4, -4], [0.1, 1.9, 0.5], [0, 1, 0]).scale(0.5),
+            "bsdf": diffuse(0.0),
+            "emitter": light(60, 55, 50),
+        },
+    )
+
+
+def cornell_box() -> mi.Scene:
+    """Mitsuba's own. Its meshes share a BSDF, but must not be merged."""
+    box = mi.cornell_box()
+    return mi.load_dict({**box, "sensor": {**box["sensor"], "film": film()}}, optimize=False)
+
+
+def bunny_box() -> mi.Scene:
+    """Figure 9 of Li et al. 2018: a bunny in a box. Only where the shared data are."""
+    box = json.loads(REDNER.read_text())["scenes"]["bunny_box"]
+    view = box["camera"]
+    shapes = {}
+    for shape in box["shapes"]:
+        name, emitter = shape["name"], shape.get("emission_radiance")
+        props = {"bsdf": diffuse(*box["materials"][shape["material"]]["reflectance"])}
+        if emitter:
+            props["emitter"] = light(*emitter)
+        if "ply_target" in shape:
+            shapes[name] = {"type": "ply", "filename": str(REDNER.parent / shape["ply_target"]), **props}
+        else:
+            shapes[name] = mesh(name, shape["vertices"], shape["indices"], **props)
+    return scene(sensor=camera(view["origin"], view["target"], fov=view["fov_deg"]), **shapes)
+
+
+def out_of_frame() -> mi.Scene:
+    """A floor that is lit only by a cube beside the frame, and the cube by a light below it, level with the floor."""
+    return scene(
+        sensor=camera((0, 2, -5), (0, 0, 0), fov=28),
+        floor=horizontal((0, 0, 0), 1.1, "floor", bsdf=diffuse(0.7)),
+        cube=mesh("cube", 0.55 * cube_vertices() + [2.4, 1.5, 0], CUBE_FACES, bsdf=diffuse(0.7, 0.6, 0.5)),
+        light=horizontal((2.4, 0.1, 0.1), 0.4, "light", bsdf=diffuse(0.0), emitter=light(30, 30, 30)),
+    )
+
+
+def open_air() -> mi.Scene:
+    """A small cube above a floor, under the sky alone."""
+    return scene(
+        sensor=camera(),
+        floor=horizontal((0, -1, 0), 3, "floor", bsdf=diffuse(0.6, 0.5, 0.4)),
+        cube=mesh("cube", 0.4 * cube_vertices() + [0.23, -0.23, 0], CUBE_FACES, bsdf=diffuse(0.4, 0.5, 0.7)),
+        environment=constant(),
+    )
+
+
 DEPTH = {"key": "cube.vertex_positions", "direction": [0, 0, 1]}
 SIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0]}
 CAMERA_X = {"key": "sensor.to_world", "direction": [1, 0, 0]}
@@ -251,6 +440,18 @@ PRINCIPAL_POINT_Y = {"key": "sensor.principal_point_offset_y", "direction": [1]}
 FLOOR_TURN = {"key": "floor.to_world", "rotate": [1, 0, 0]}
 FOCUS = {"key": "sensor.focus_distance", "direction": [1]}
 CROP = {"width": 64, "height": 48, "crop_width": RES, "crop_height": RES, "crop_offset_x": 20, "crop_offset_y": 4}
+
+
+BLOCKER_UP = {"key": "blocker.vertex_positions", "direction": [0, 1, 0]}
+LIGHT_SIDE = {"key": "light.vertex_positions", "direction": [1, 0.3, 0.2]}
+FLOOR_SIDE = {"key": "floor.vertex_positions", "direction": [1, 0, 0]}
+FLOOR_UP = {"key": "floor.vertex_positions", "direction": [0.2, 1, 0]}
+SPHERE_SIDE = {"key": "sphere.vertex_positions", "direction": [1, 0.3, 0]}
+BUNNY_SIDE = {"key": "bunny.vertex_positions", "direction": [1, 0, 0]}
+BOX_SIDE = {"key": "small-box.vertex_positions", "direction": [1, 0, 0.4]}
+ORBIT = {"key": "sensor.to_world", "rotate": [0, 1, 0], "pivot": [0, 0, 0]}
+BLOCKER_SIDE = {"key": "blocker.vertex_positions", "direction": [1, 0, 0]}
+INTO_THE_SCREEN = {"key": "sensor.to_world", "direction": [0, -0.371391, 0.928477]}
 
 
 def vertex(name: str, index: int) -> dict:
@@ -327,6 +528,61 @@ CASES = [
     Case("room_camera", room(), CAMERA_X, 6e-3, tolerance=0.06, spp=1024),
     Case("room_light", room(), {"key": "light.to_world", "direction": [1, -0.5, 0]}, 1e-2, tolerance=0.06, spp=1024),
     Case("room_floor_turns", room(), FLOOR_TURN, 6e-3, tolerance=0.06, spp=1024, runs=48),
+    # Figure 7 of Li et al. 2018: within 1 % at 32,768 samples per pixel.
+    Case("shadow_blocker", shadow_blocker(), BLOCKER_UP, 2.5e-2, 0.01, spp=2048, runs=100),
+    Case("shadow_camera", shadow_blocker(), INTO_THE_SCREEN, 3e-2, 0.01, spp=2048, runs=64),
+    Case("shadow_small_light", shadow_blocker(half_side=3e-3), BLOCKER_UP, 1e-2, 0.03, spp=1024, runs=24),
+    # Far from the origin single precision is as coarse as 1e-4; the step is a power of two, which it represents.
+    Case("shadow_far_away", shadow_blocker(shift=(500, -800, 2000)), BLOCKER_UP, 2**-5, 0.03, spp=1024, runs=32),
+    Case("shadow_light", shadow_blocker(), LIGHT_SIDE, 2e-2, 0.03, spp=1024, runs=24),
+    Case("shadow_floor", shadow_blocker(), FLOOR_UP, 6e-3, 0.03, spp=1024, runs=24),
+    Case("shadow_thin_lens", shadow_blocker(lens_over_blocker), BLOCKER_UP, 3e-2, 0.03, spp=1024, runs=40),
+    Case("glossy_receiver", glossy_receiver(0.01), BLOCKER_SIDE, 8e-3, 0.03, spp=1024, runs=40),
+    Case("mirror_receiver", glossy_receiver(5e-4), BLOCKER_SIDE, 5e-3, 0.03, spp=1024, runs=24, noisy=True),
+    # Zero, but for the floor's outline.
+    Case("near_light", near_light, FLOOR_SIDE, 4e-3, 0.03, spp=1024, runs=24),
+    # These two must agree with each other, too.
+    Case(
+        "mirrored_sphere",
+        mirrored_sphere(False),
+        SPHERE_SIDE,
+        4e-2,
+        0.03,
+        spp=512,
+        runs=64,
+        integrator=prb_edge(3),
+        noisy=True,
+    ),
+    Case(
+        "mirrored_sphere_seam",
+        mirrored_sphere(True),
+        SPHERE_SIDE,
+        4e-2,
+        0.03,
+        spp=512,
+        runs=64,
+        integrator=prb_edge(3),
+        noisy=True,
+    ),
+    Case("cornell_box", cornell_box, BOX_SIDE, 1.5e-2, 0.03, runs=15, integrator=prb_edge(5), noisy=True),
+    Case("cornell_box_camera", cornell_box, ORBIT, 8e-3, 0.03, runs=15, integrator=prb_edge(5), noisy=True),
+    Case(
+        "bunny_box",
+        bunny_box,
+        BUNNY_SIDE,
+        1e-2,
+        0.03,
+        spp=64,
+        runs=36,
+        integrator=prb_edge(7),
+        largest_z=7,  # smooth-shaded
+        noisy=True,
+        reference_spp=4096,
+        needs=REDNER,
+    ),
+    # Derivatives of geometry that is met at indirect bounces only.
+    Case("out_of_frame", out_of_frame, SIDE, 0.12, 0.03, spp=1024, runs=100, integrator=prb_edge(3), noisy=True),
+    Case("open_air", open_air, SIDE, 1e-2, 0.03, spp=1024, runs=96, integrator=prb_edge(3), noisy=True),
 ]
 
 

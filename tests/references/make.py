@@ -1,7 +1,7 @@
 """Make the references of the derivative tests:  python tests/references/make.py [--missing | NAME ...]
 
-Central differences of `path` at 32 × 32, common random numbers, 12 runs of 16,384 stratified samples a pixel, or more
-(`Case.runs`): about 20 s each on two cores.
+Central differences of `path` at 32 × 32, common random numbers, 12 runs of 16,384 stratified samples a pixel, or other
+numbers (`Case.runs`, `Case.reference_spp`): about 20 s each on two cores, minutes for paths of many bounces.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ import mitsuba as mi
 
 from rimlight.edge_sampling import Motion, finite_differences
 
-SPP = 16384
-
 
 def main(names: list[str]) -> None:
     mi.set_variant("llvm_ad_rgb")
@@ -32,6 +30,9 @@ def main(names: list[str]) -> None:
         if (c.name in names if names and names != ["--missing"] else names == [] or not c.reference.exists())
     ]
     for c in wanted:
+        if c.needs and not c.needs.exists():
+            print(f"{c.name}: not made, needs {c.needs}")
+            continue
         start = time.time()
         scene = c.scene()
         reference = finite_differences(
@@ -39,7 +40,9 @@ def main(names: list[str]) -> None:
             Motion(scene, **c.motion),
             step=c.step,
             runs=c.runs,
-            spp=SPP,
+            spp=c.reference_spp,
+            # Without Russian roulette: its random choices would differ between the images of a run.
+            integrator=mi.load_dict({"type": "path", "max_depth": c.max_depth, "rr_depth": 1000}),
             progress=True,
         )
         command = f"python tests/references/make.py {c.name}"
