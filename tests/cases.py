@@ -276,7 +276,8 @@ def horizontal(centre, half: float, name: str, down: bool = False, **props: dict
 def shadow_blocker(
     sensor: Callable[..., dict] = camera, half_side: float = 0.1, shift=(0, 0, 0)
 ) -> Callable[[], mi.Scene]:
-    """Figure 7b of Li et al. 2018: a square above the frame, between a floor and an area light, always equally strong.
+    """Figure 7b and c of Li et al. 2018: a square above the frame, between a floor and an area light that is always
+    equally strong.
 
     half_side : of the light.
     shift : of everything.
@@ -311,8 +312,9 @@ def conductor(alpha: float) -> dict:
 
 
 def glossy_receiver(alpha: float) -> Callable[[], mi.Scene]:
-    """Figure 7c of Li et al. 2018: the frame is filled by a glossy floor. It mirrors a wide light, and in front of it a
-    blocker, which is not in the frame itself and has two slanted sides."""
+    """redner's test of glossy shadows: the frame is filled by a glossy floor. It mirrors a wide light, and in front of
+    it a blocker, which is not in the frame itself. One of its sides is slanted here, lest its reflection end exactly
+    between two pixels."""
 
     def build() -> mi.Scene:
         blocker = [[0, 1, 0.5], [0.2, 3, 0.5], [0.8, 1, 0.5], [0.8, 3, 0.5]]
@@ -327,7 +329,7 @@ def glossy_receiver(alpha: float) -> Callable[[], mi.Scene]:
 
 
 def near_light() -> mi.Scene:
-    """Figure 9 of Li et al. 2018: a floor under a small light close to it."""
+    """Figure 9 of Li et al. 2018: a floor under a small light close to it, which is bright in its middle."""
     return scene(
         sensor=camera((0, 2.5, -2.5)),
         floor=horizontal((0.03, 0, 0.02), 0.7, "floor", bsdf=diffuse(0.5)),
@@ -391,7 +393,7 @@ def cornell_box() -> mi.Scene:
 
 
 def bunny_box() -> mi.Scene:
-    """Figure 9 of Li et al. 2018: a bunny in a box. Only where the shared data are."""
+    """redner's test of global illumination: a bunny in a box. Only where the shared data are."""
     box = json.loads(REDNER.read_text())["scenes"]["bunny_box"]
     view = box["camera"]
     shapes = {}
@@ -531,8 +533,10 @@ CASES = [
     # Figure 7 of Li et al. 2018: within 1 % at 32,768 samples per pixel.
     Case("shadow_blocker", shadow_blocker(), BLOCKER_UP, 2.5e-2, 0.01, spp=2048, runs=100),
     Case("shadow_camera", shadow_blocker(), INTO_THE_SCREEN, 3e-2, 0.01, spp=2048, runs=64),
+    # A nearly sharp shadow: the penumbra is 0.06 pixels wide.
     Case("shadow_small_light", shadow_blocker(half_side=3e-3), BLOCKER_UP, 1e-2, 0.03, spp=1024, runs=24),
     # Far from the origin single precision is as coarse as 1e-4; the step is a power of two, which it represents.
+    # Mitsuba's shadow rays start 0.18 above the floor there: image and derivative differ from those at the origin.
     Case("shadow_far_away", shadow_blocker(shift=(500, -800, 2000)), BLOCKER_UP, 2**-5, 0.03, spp=1024, runs=32),
     Case("shadow_light", shadow_blocker(), LIGHT_SIDE, 2e-2, 0.03, spp=1024, runs=24),
     Case("shadow_floor", shadow_blocker(), FLOOR_UP, 6e-3, 0.03, spp=1024, runs=24),
@@ -580,7 +584,7 @@ CASES = [
         reference_spp=4096,
         needs=REDNER,
     ),
-    # Derivatives of geometry that is met at indirect bounces only.
+    # Geometry that moves at indirect bounces: only there, and in the frame as well.
     Case("out_of_frame", out_of_frame, SIDE, 0.12, 0.03, spp=1024, runs=100, integrator=prb_edge(3), noisy=True),
     Case("open_air", open_air, SIDE, 1e-2, 0.03, spp=1024, runs=96, integrator=prb_edge(3), noisy=True),
 ]

@@ -329,10 +329,16 @@ def header(quick: bool) -> dict[str, Any]:
     }
 
 
-def machine(h: dict[str, Any]) -> str:
-    what = f"{h['processor']}, {h['threads']} threads; LLVM {h['llvm']}, Mitsuba {h['mitsuba']}, Dr.Jit {h['drjit']}"
-    rough = " **A quick run: its numbers are rough.**" if h["quick"] else ""
-    return f"{what}; Rimlight {h['rimlight']}, commit {h['commit']}; {h['date']}.{rough}"
+def machine(headers: list[dict[str, Any]]) -> list[str]:
+    """Where cases were measured, with the commits at which they were."""
+    commits: dict[str, list[str]] = {}
+    for h in headers:
+        what = (
+            f"{h['processor']}, {h['threads']} threads; LLVM {h['llvm']}, Mitsuba {h['mitsuba']}, Dr.Jit {h['drjit']}"
+        )
+        rough = " **A quick run: its numbers are rough.**" if h["quick"] else ""
+        commits.setdefault(f"{what}; Rimlight {h['rimlight']}, {h['date']}.{rough}", []).append(h["commit"])
+    return [f"{what} Commits: {', '.join(dict.fromkeys(found))}." for what, found in commits.items()]
 
 
 def table(columns: dict[str, Callable[[Any], Any]], rows: list[Any]) -> list[str]:
@@ -417,11 +423,12 @@ def figure(columns: int, width: float = 4.0, height: float = 3.6) -> tuple[Any, 
 
 
 def plain_ticks(axes: Any) -> None:
-    """Numbers at 1 and 3 of each power of ten of logarithmic axes."""
+    """Numbers at 1 and 3 of each power of ten of logarithmic axes, unless there are many of them."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis in (axes.xaxis, axes.yaxis):
-        if axis.get_scale() == "log":
+        low, high = axis.get_view_interval()
+        if axis.get_scale() == "log" and high / low < 3e3:
             axis.set_major_locator(LogLocator(subs=(1, 3)))
             axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
             axis.set_minor_formatter(NullFormatter())
@@ -497,8 +504,7 @@ def main(benchmark: Benchmark) -> None:
         found[name] = {"header": header(args.quick), **_in_a_process(name, args)}
         file.write_text(json.dumps({"cases": found}, indent=1) + "\n", encoding="utf-8")
     found = {name: found[name] for name in benchmark.cases if name in found}
-    headers = list(dict.fromkeys(machine(case["header"]) for case in found.values()))
-    lines = "\n".join([*headers, "", *benchmark.report(found)])
+    lines = "\n".join([*machine([case["header"] for case in found.values()]), "", *benchmark.report(found)])
     (args.out / f"{benchmark.name}.md").write_text(lines.rstrip() + "\n", encoding="utf-8")
     benchmark.plot(found, args.out)
     print(f"Written to {args.out}")

@@ -219,15 +219,6 @@ def report(found: dict[str, Any]) -> list[str]:
                 found["depth"]["depths"],
             ),
         ]
-    if "convergence" in found:
-        lines += [
-            f"Convergence ({found['convergence']['scene']}, 96 × 96 pixels):",
-            "",
-            "```{image} performance/global_illumination_convergence.png",
-            ":alt: Derivative images, less and less noisy",
-            "```",
-            "",
-        ]
     compared = [s for key, case in found.items() if key.startswith("redner_") for s in case["scenes"]]
     if compared:
         lines += _redner_text(compared)

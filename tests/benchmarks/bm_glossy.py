@@ -160,7 +160,6 @@ def report(found: dict[str, Any]) -> list[str]:
                 },
                 case["choices"],
             ),
-            "```{image} performance/glossy_choice.png\n:alt: Derivative images by edges chosen in three ways\n```",
             "",
         ]
     if "roughness" in found:
