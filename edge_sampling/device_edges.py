@@ -17,7 +17,7 @@ class DeviceEdges:
     """Topology of `Edges` as Dr.Jit arrays. Vertex positions are given with each call, since they change."""
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
-    DRJIT_STRUCT = dict.fromkeys(("count", "_ends", "_opposite", "_kind", "_kinds", "_any_split"))
+    DRJIT_STRUCT = dict.fromkeys(("count", "_ends", "_opposite", "_kind", "_kinds", "_any_split", "_two_faces"))
 
     def __init__(self, edges: Edges):
         index = lambda a: mi.UInt32(np.ascontiguousarray(a))
@@ -26,6 +26,7 @@ class DeviceEdges:
         self._opposite = [index(edges.opposite[:, side]) for side in (0, 1)]
         self._kind = index(edges.kind)
         self._kinds = frozenset(edges.kind)
+        self._two_faces = mi.Bool(edges.count == 2)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
@@ -59,6 +60,31 @@ class DeviceEdges:
             o = dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, opposite, edge))
             sides.append(dr.sign(dr.dot(o - p, across)))
         return dr.select(sides[0] == sides[1], -sides[0], 0)
+
+    def is_hidden_fold(
+        self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]
+    ) -> mi.Bool:
+        """Do two rays, close by on both sides of an edge that is no silhouette, miss its faces?
+
+        Then a face is seen at so grazing an angle that the ray has left it, and met what lies beyond its other edges:
+        a jump that is theirs, and would count twice.
+
+        p : a point of the edge that the rays pass, world space.
+        """
+        a, b = self.end_points(positions, edge)
+        # Half-way between the rays is the line of sight itself: faces may be closer to it than the rays are.
+        line_of_sight = p - dr.lerp(rays[0].o, rays[1].o, 0.5)
+        fold = dr.gather(mi.Bool, self._two_faces, edge)
+        fold &= self.outward(positions, edge, p, dr.cross(b - a, line_of_sight)) == 0
+        passed = [mi.Bool(False), mi.Bool(False)]
+        for opposite in self._opposite:
+            o = dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, opposite, edge))
+            for k, ray in enumerate(rays):
+                corners = [c - ray.o for c in (a, b, o)]
+                turns = [dr.dot(ray.d, dr.cross(corners[i], corners[i - 1])) for i in range(3)]
+                passed[k] |= (dr.minimum(*turns[:2]) > 0) & (turns[2] > 0)
+                passed[k] |= (dr.maximum(*turns[:2]) < 0) & (turns[2] < 0)
+        return fold & ~(passed[0] & passed[1])
 
     def normals_differ(self, normals: mi.Float, edge: mi.UInt32) -> mi.Float:
         """By how much the vertex normals of the two sides differ at most."""

@@ -104,7 +104,8 @@ class FilmBoundary:
             n_dl = mi.Vector2f(-along_film.y, along_film.x) * (dt / density)
             n = dr.normalize(n_dl)
             u = dr.detach(u)
-            offset = self._offset(projection, dr.lerp(a, b, t)) * n
+            p = dr.lerp(a, b, t)
+            offset = self._offset(projection, p) * n
             active = (
                 (density > 0)
                 & (segment.length > 0)
@@ -116,6 +117,7 @@ class FilmBoundary:
                 time += sampler.next_1d() * sensor.shutter_open_time()
             wavelength_sample = sampler.next_1d() if mi.is_spectral else 0.0
             jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
+            rays, weights = [], []
             for sign in (-1, 1):
                 ray, weight = sensor.sample_ray_differential(
                     time,
@@ -124,6 +126,11 @@ class FilmBoundary:
                     mi.Point2f(0.5) if aperture_sample is None else aperture_sample,
                     active,
                 )
+                rays.append(ray)
+                weights.append(weight)
+            is_edge = edge < self.edges.count
+            active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, edge, 0), p, rays))
+            for sign, ray, weight in zip((-1, 1), rays, weights, strict=True):
                 L, alpha = radiance(ray, sampler.clone(), active)
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
@@ -203,9 +210,10 @@ class FilmBoundary:
     def _offset(self, projection: Projection, p: mi.Point3f) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart."""
         ulp = dr.epsilon(mi.Float) * 2
-        in_world = 8 * ulp * dr.max(dr.abs(mi.Vector3f(p))) * projection.pixels_per_unit(projection.film(p))
+        largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
+        in_world = 8 * ulp * largest * projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
-        return in_world + on_film + 1e-4
+        return in_world + on_film
 
 
 @dataclass(frozen=True)

@@ -579,7 +579,6 @@ CASES = [
         spp=64,
         runs=36,
         integrator=prb_edge(7),
-        largest_z=7,  # contours of the bunny that nearly coincide on the film count too much: a few pixels are biased
         noisy=True,
         reference_spp=4096,
         needs=REDNER,

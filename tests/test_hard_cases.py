@@ -339,3 +339,20 @@ def test_small_scenes_give_finite_derivatives(integrator):
 
 def test_large_scenes_give_the_same_derivative_both_ways():
     assert_finite(Hard(lambda: scaled(1e6)[0]), mi.load_dict(INTEGRATORS["direct_edge"]))
+
+
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+@pytest.mark.parametrize("gap", [2e-6, 1e-5, 1e-4])
+def test_fold_beside_a_contour_counts_once(kind, gap):
+    """The outer face of a black box is seen edge-on, but for `gap`: its two long edges are closer on the film than the
+    rays beside them, and one of them is no silhouette."""
+    vertices = [[-1, -1, 0], [0, -1, 0], [0, 1, 0], [-1, 1, 0], [gap, -1, 1], [gap, 1, 1]]
+    box = cases.mesh("thing", vertices, [[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]], bsdf=cases.diffuse(0.0))
+    sensor = camera((0, 0, -4), (0, 0, 0), kind=kind)
+    scene = cases.scene(sensor=sensor, thing=box, sky={"type": "constant"})
+    motion = Motion(scene, "thing.vertex_positions", direction=[1, 0, 0], vertices=[1, 2, 4, 5])
+    image = np.array(derivative_image(scene, mi.load_dict({"type": "direct_edge"}), motion, spp=256, seed=0))
+    # The contour turns the sky black. In perspective, it is the far edge, and those that lead to it.
+    pixels_per_unit = 16 / 4 if kind == "orthographic" else 16 / 2 / np.tan(np.radians(22.5))
+    area = 2 if kind == "orthographic" else 1 / 5**2 + 1 / 4**2
+    assert image[..., 0].sum() == pytest.approx(-area * pixels_per_unit**2, rel=0.01)
