@@ -78,14 +78,15 @@ def sample_edge(
         weight = mi.Float(preference)
         # A few edges are tested faster than their node.
         if len(use) > 1 and max(tree.depths) > 0:
-            weight *= importance(tree.node(mi.UInt32(tree.node_offsets[k] + 1)), view, from_light)
+            weight *= importance(tree.node(tree.device_node_offsets[k] + 1), view, from_light)
         total += weight
         p = dr.select(total > 0, weight / total, 0)
         taken = choice < p
         choice = dr.select(taken, choice / p, (choice - p) / (1 - p))
         density = dr.select(taken, p, density * (1 - p))
-        bottom[taken], node_offset[taken] = 1 << tree.depths[k], tree.node_offsets[k]
-        leaf_offset[taken] = tree.leaf_offsets[k]
+        bottom = dr.select(taken, tree.bottoms[k], bottom)
+        node_offset = dr.select(taken, tree.device_node_offsets[k], node_offset)
+        leaf_offset = dr.select(taken, tree.device_leaf_offsets[k], leaf_offset)
     node = dr.full(mi.UInt32, 1, width)
     alive = mi.Bool(active) & (total > 0)
 

@@ -104,7 +104,7 @@ class EdgeTree:
     groups : indices into `edges`, a tree for each; without the empty ones.
     """
 
-    _NUMBERS = ("leaf_size", "depths", "node_offsets", "leaf_offsets")
+    _NUMBERS = ("leaf_size", "depths", "bottoms", "device_node_offsets", "device_leaf_offsets")
     DRJIT_STRUCT = dict.fromkeys(  # for `dr.freeze`
         ("device_edges", "centre", "slot_edge", "_used", "_open", "nodes", "slots", *_NUMBERS)
     )
@@ -115,38 +115,45 @@ class EdgeTree:
         position = geometry.host_positions()
         ends = position[edges.vertices[:, 0]]
         centres = np.where(np.isfinite(ends), ends, 0).mean(1)
-        self.centre = mi.Point3f(*map(float, np.median(centres, axis=0)))
-        slots, self.depths, self.leaf_size = [], [], 0
+        # Opaque, like the offsets below: scenes that differ in numbers only share their kernels.
+        self.centre = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in np.median(centres, axis=0)))
+        slots, self.depths, leaf_size = [], [], 0
         self.node_offsets, self.leaf_offsets = [0], [0]
         for group in groups:
             order = _order(centres[group])
             slots.append(np.where(order < 0, -1, group[order]))
             leaves = len(order)
-            self.leaf_size = max(self.leaf_size, int((order >= 0).sum(1).max()))
+            leaf_size = max(leaf_size, int((order >= 0).sum(1).max()))
             self.depths.append(leaves.bit_length() - 1)
             self.node_offsets.append(self.node_offsets[-1] + 2 * leaves)
             self.leaf_offsets.append(self.leaf_offsets[-1] + leaves)
+        opaque = lambda numbers: [dr.opaque(mi.UInt32, x) for x in numbers]
+        self.leaf_size = dr.opaque(mi.UInt32, leaf_size)
+        self.bottoms = opaque(1 << depth for depth in self.depths)
+        self.device_node_offsets, self.device_leaf_offsets = map(opaque, (self.node_offsets, self.leaf_offsets))
         slot = np.concatenate(slots).reshape(-1)
         self.slot_edge = mi.UInt32(np.maximum(slot, 0).astype(np.uint32))
         self._used = mi.Bool(slot >= 0)
         self._open = mi.Bool(edges.count[np.maximum(slot, 0)] != 2)
-        self.nodes = dr.zeros(mi.Float, self.node_offsets[-1] * NODE_PACKETS * 4)
-        self.slots = dr.zeros(mi.Float, self.leaf_offsets[-1] * LEAF * SLOT_PACKETS * 4)
+        # An array for each packet: several scatters to one array would be as many kernels.
+        self.nodes = [dr.zeros(mi.Float, self.node_offsets[-1] * 4) for _ in range(NODE_PACKETS)]
+        self.slots = [dr.zeros(mi.Float, self.leaf_offsets[-1] * LEAF * 4) for _ in range(SLOT_PACKETS)]
 
     @property
     def bytes(self) -> int:
         """Memory of the tree on the device, without the edges that it is over."""
-        return 4 * (dr.width(self.nodes) + dr.width(self.slots) + dr.width(self.slot_edge)) + 5 * dr.width(self._used)
+        words = sum(dr.width(a) for a in (*self.nodes, *self.slots, self.slot_edge))
+        return 4 * words + 2 * dr.width(self._used)
 
     # ---------------------- Access ----------------------
 
     def node(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Node:
         """Nodes by their number in all trees together. Of tree k, the root is number `node_offsets[k]` + 1; children
         of its node i are 2i and 2i + 1."""
-        return Node.unpack(_gather(self.nodes, index, NODE_PACKETS, active))
+        return Node.unpack(_gather(self.nodes, index, active))
 
     def slot(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Slot:
-        return Slot.unpack(_gather(self.slots, index, SLOT_PACKETS, active))
+        return Slot.unpack(_gather(self.slots, index, active))
 
     # ---------------------- Refit ----------------------
 
@@ -163,7 +170,7 @@ class EdgeTree:
                 for level in reversed(range(depth)):
                     first, offset = (dr.opaque(mi.UInt32, k * 2**level + nodes) for k in (1, 2))
                     i = dr.arange(mi.UInt32, 2**level)
-                    pair = [Node.unpack(_gather(self.nodes, 2 * i + offset + k, NODE_PACKETS)) for k in (0, 1)]
+                    pair = [Node.unpack(_gather(self.nodes, 2 * i + offset + k)) for k in (0, 1)]
                     _scatter(self.nodes, i + first, _merge(*pair).pack())
 
     def _slots_of(self, positions: mi.Float, slot: mi.UInt32) -> Slot:
@@ -200,7 +207,7 @@ class EdgeTree:
         used = length > 0
         widest = lambda f, empty: [dr.select(used, f(x, y), empty) for x, y in zip(s.a, s.b, strict=True)]
         # Wider than what the test of a single edge lets pass.
-        slack = 4 * EDGE_ON
+        slack = 4 * EDGE_ON * mi.Vector4f(1, 1, 1, dr.norm(s.a) + dr.norm(s.b))
         return Node(
             length * (1 - s.always),
             length * s.always,
@@ -240,14 +247,14 @@ def _merge(p: Node, q: Node) -> Node:
     )
 
 
-def _gather(source: mi.Float, index: mi.UInt32, packets: int, active: mi.Bool | bool = True) -> list[mi.Vector4f]:
-    return [dr.gather(mi.Vector4f, source, index * packets + k, active) for k in range(packets)]
+def _gather(sources: list[mi.Float], index: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.Vector4f]:
+    return [dr.gather(mi.Vector4f, source, index, active) for source in sources]
 
 
-def _scatter(target: mi.Float, index: mi.UInt32, packets: list[mi.Vector4f]) -> None:
-    for k, packet in enumerate(packets):
-        dr.scatter(target, packet, index * len(packets) + k)
-    dr.eval(target)
+def _scatter(targets: list[mi.Float], index: mi.UInt32, packets: list[mi.Vector4f]) -> None:
+    for target, packet in zip(targets, packets, strict=True):
+        dr.scatter(target, packet, index)
+    dr.eval(targets)
 
 
 # ---------------------- Order ----------------------

@@ -53,7 +53,7 @@ class Setup:
 
     def numbers(self, which: str) -> np.ndarray:
         """Numbers of each of the `nodes` or `slots`."""
-        return np.array(getattr(self.tree, which)).reshape(-1, 40 if which == "nodes" else 16)
+        return np.concatenate([np.array(packet).reshape(-1, 4) for packet in getattr(self.tree, which)], axis=1)
 
     def root(self, group: int = 0) -> dict[str, np.ndarray]:
         node = self.tree.node(mi.UInt32(self.tree.node_offsets[group] + 1))
@@ -180,7 +180,8 @@ def moved(setup: Setup) -> mi.Float:
 def test_refit_leaves_nothing_of_the_former_positions(groups):
     options = {"groups": groups} if groups else {}
     refitted, fresh = (tree_over(*still_life(), **options) for _ in range(2))
-    fresh.tree.nodes, fresh.tree.slots = dr.zeros_like(fresh.tree.nodes), dr.zeros_like(fresh.tree.slots)
+    for arrays in (fresh.tree.nodes, fresh.tree.slots):
+        arrays[:] = [dr.zeros_like(a) for a in arrays]
     for setup in (refitted, fresh):
         before = setup.numbers("nodes")
         setup.tree.refit(moved(setup))
