@@ -1,6 +1,6 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
-from .edge_importance import EdgeSample, Lobe, View, sample_edge
+from .edge_importance import Cone, EdgeSample, Lobe, View, sample_edge, stratified
 from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, find_edges
 from .film_boundary import BoundarySamples, FilmBoundary
@@ -14,6 +14,7 @@ from .zscores import mean_and_error, z_scores
 
 __all__ = [
     "BoundarySamples",
+    "Cone",
     "EdgeKind",
     "EdgeSample",
     "EdgeTree",
@@ -33,5 +34,6 @@ __all__ = [
     "jumping_textures",
     "mean_and_error",
     "sample_edge",
+    "stratified",
     "z_scores",
 ]

@@ -24,6 +24,23 @@ class Lobe:
 
 
 @dataclass
+class Cone:
+    """Directions that matter: those within an angle α < 90° of an axis; or all of them, where its cosine is -1.
+
+    axis : mi.Vector3f, unit length.
+    cos, sin : mi.Float, of α.
+    """
+
+    axis: mi.Vector3f
+    cos: mi.Float
+    sin: mi.Float
+
+    @property
+    def everything(self) -> mi.Bool:
+        return self.cos < 0
+
+
+@dataclass
 class View:
     """From where the edges are looked at, and what is wanted of them: a sum of weights of directions.
 
@@ -31,12 +48,14 @@ class View:
     n : mi.Vector3f, unit normal: directions below its plane are of no use. Zero where all are.
     wide : mi.Float, weight of all directions above the plane, by their cosine.
     lobes : around which there is more.
+    cone : outside of which there is nothing; None: all directions count.
     """
 
     p: mi.Vector3f
     n: mi.Vector3f
     wide: mi.Float
     lobes: list[Lobe]
+    cone: Cone | None = None
 
 
 @dataclass
@@ -54,12 +73,20 @@ class EdgeSample:
 
 
 def sample_edge(
-    tree: EdgeTree, view: View, sampler: mi.Sampler, use: list[mi.Float | float], *, from_light: bool, active: mi.Bool
+    tree: EdgeTree,
+    view: View,
+    sampler: mi.Sampler,
+    use: list[mi.Float | float],
+    *,
+    choice: mi.Float,
+    from_light: bool,
+    active: mi.Bool,
 ) -> EdgeSample:
     """Descend the tree at random, in proportion to the importance of the children of each node; test the edges of the
     leaf one by one; choose a point on one.
 
     use : for each group of edges of the tree, how much to prefer it; 0: do not choose from it.
+    choice : uniform in [0, 1); makes the first choices, so it pays to stratify it.
     from_light : the importance of an edge falls off with the square of its distance, not with the distance itself.
 
     Returns
@@ -72,8 +99,8 @@ def sample_edge(
 
     # ---------------------- Which group ----------------------
 
-    # One random number serves for the group, the edge and the point: what is left of it after each choice is uniform.
-    total, choice = mi.Float(0), mi.Float(sampler.next_1d(active))
+    # What is left of a random number after each choice is uniform again.
+    total, choice = mi.Float(0), mi.Float(choice)
     for k, preference in enumerate(use):
         weight = mi.Float(preference)
         # A few edges are tested faster than their node.
@@ -94,21 +121,29 @@ def sample_edge(
 
     if max(tree.depths) > 0:
 
-        def down(node, density, alive, sampler):
+        def down(node, density, choice, alive, sampler):
             child = 2 * node
             weights = [importance(tree.node(child + k + node_offset, alive), view, from_light) for k in (0, 1)]
             total = weights[0] + weights[1]
             alive &= total > 0
-            right = sampler.next_1d(alive) * total >= weights[0]
-            density = dr.select(alive, density * dr.select(right, weights[1], weights[0]) / total, 0)
-            return dr.select(alive, child + dr.select(right, mi.UInt32(1), mi.UInt32(0)), node), density, alive, sampler
+            choice = _renewed(choice, density, sampler, alive)
+            p = weights[0] / total
+            left = choice < p
+            choice = dr.select(left, choice / p, (choice - p) / (1 - p))
+            density = dr.select(alive, density * dr.select(left, p, 1 - p), 0)
+            node = dr.select(alive, child + dr.select(left, mi.UInt32(0), mi.UInt32(1)), node)
+            return node, density, choice, alive, sampler
 
-        node, density, alive, sampler = dr.while_loop(
-            (node, density, alive, sampler), lambda n, d, a, s: a & (n < bottom), down, label="edge tree"
+        node, density, choice, alive, sampler = dr.while_loop(
+            (node, density, choice, alive, sampler),
+            lambda n, d, c, a, s: a & (n < bottom),
+            down,
+            label="edge tree",
         )
 
     # ---------------------- The edges of the leaf ----------------------
 
+    choice = _renewed(choice, density, sampler, alive)
     first = (node - bottom + leaf_offset) * LEAF
 
     def test(k, total, chosen, weight, choice):
@@ -133,6 +168,21 @@ def sample_edge(
     t, pdf = _sample_point(tree.slot(slot, alive), view, which, choice)
     density = dr.select(alive, density * weight / total * pdf, 0)
     return EdgeSample(dr.gather(mi.UInt32, tree.slot_edge, slot, alive), t, dr.select(dr.isfinite(density), density, 0))
+
+
+def _renewed(choice: mi.Float, density: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+    """A random number has 24 bits. Where choices have used up eight, a fresh one takes its place."""
+    return dr.select(density < 2**-8, sampler.next_1d(active), choice)
+
+
+def stratified(sampler: mi.Sampler, seed: mi.UInt32 | int) -> mi.Float:
+    """Uniform numbers, of which each 64 that follow one another are stratified, and each 2, 4, … of these as well:
+    the van der Corput sequence, jittered, and shifted for each 64 by another random number, so that each number by
+    itself is uniform."""
+    i = dr.arange(mi.UInt32, sampler.wavefront_size())
+    shift = mi.sample_tea_float32(i >> 6, dr.opaque(mi.UInt32, seed) if isinstance(seed, int) else seed)
+    x = (mi.Float(dr.brev(i << 26)) + sampler.next_1d()) / 64 + shift
+    return dr.minimum(x - dr.floor(x), dr.one_minus_epsilon(mi.Float))
 
 
 # ---------------------- Importance ----------------------
@@ -171,11 +221,23 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
     cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(above * dr.rsqrt(r2), 0, 1))
     weight = view.wide * cosine
     for lobe in view.lobes:
-        # How far from the axis does the node begin?
-        along = dr.dot(lobe.axis, d)
-        off2 = dr.select(along > 0, dr.squared_norm(d) - along * along, r2)
-        gap2 = dr.square(dr.maximum(dr.safe_sqrt(off2) - dr.sqrt(size2), 0)) / r2
-        weight += lobe.peak * _falloff(gap2 / dr.square(lobe.width))
+        # What the lobe is on average over the directions of the node: one that is wider, by the extent of the node.
+        along, off2 = _along_and_off(lobe.axis, d)
+        narrow2 = dr.square(lobe.width) * r2
+        wide2 = narrow2 + size2 / 3
+        weight += lobe.peak * narrow2 / wide2 * _falloff(dr.select(along > 0, off2, r2) / wide2)
+    if view.cone is not None:
+        cone = view.cone
+        # About the part of the node that is inside: of its extent across the plane that touches the cone on the side of
+        # the node, and of its extent along this plane. 0 only if it is certainly outside.
+        along, off2 = _along_and_off(cone.axis, d)
+        outwards = (d - cone.axis * along) * (cone.cos * dr.rsqrt(off2)) - cone.axis * cone.sin
+        middle, extent = dr.dot(outwards, d), dr.dot(dr.abs(outwards), half)
+        inside = dr.clip(0.5 - 0.5 * middle / extent, 0, 1)
+        narrow2 = dr.square(cone.sin) * r2
+        # Where the cone has no axis at the node, or the node no extent, it is as good as inside.
+        certain = cone.everything | (off2 == 0) | (extent == 0)
+        weight *= dr.select(certain, 1, inside * narrow2 / (narrow2 + size2 / 3))
     result = length * weight * (dr.rcp(r2) if from_light else dr.rsqrt(r2))
     return dr.select(possible & (length > 0) & dr.isfinite(result), result, 0)
 
@@ -184,9 +246,9 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     """What `importance` is for a node, for a single edge. Zero where that is no boundary."""
     y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -1)
     signs = [dr.dot(q, y) for q in slot.planes]
-    a, b = slot.a - view.p, slot.b - view.p
+    edge_on = EDGE_ON * dr.norm(slot.a - view.p)
+    a, b, start, end = _in_cone(slot, view)
     length_a, length_b = dr.norm(a), dr.norm(b)
-    edge_on = EDGE_ON * length_a
     boundary = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
     above = [dr.dot(view.n, v) for v in (a, b)]
     everywhere = dr.all(view.n == 0)
@@ -198,12 +260,13 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     cosine = dr.clip(0.5 * (above[0] / length_a + above[1] / length_b), 0, 1) + _MARGIN[from_light]
     result = view.wide * angle * dr.select(everywhere, 1, cosine)
     for lobe in view.lobes:
-        e = slot.b - slot.a
+        e = b - a
         length = dr.norm(e)
         result += _narrow(lobe, a, e / length, length, across / length).total
     if from_light:
         result *= dr.rsqrt(product)
-    return dr.select(boundary & (across > 0) & dr.isfinite(result), result, 0)
+    boundary &= (across > 0) & (start < end)
+    return dr.select(boundary & dr.isfinite(result), result, 0)
 
 
 #: Added to the cosine of an edge, by whether a light looks: it stands for all of the edge, and the normal at a shading
@@ -214,6 +277,45 @@ _MARGIN = {False: 0.05, True: 0.02}
 def _quadratic(y):
     products = [(1 if i == j else 2) * y[i] * y[j] for i in range(4) for j in range(i, 4)]
     return lambda m: sum(a * b for a, b in zip(m, products, strict=True))
+
+
+def _along_and_off(axis: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """Part of d along an axis, and the square of its distance from the axis."""
+    along = dr.dot(axis, d)
+    return along, dr.squared_norm(d - axis * along)
+
+
+def _in_cone(slot: Slot, view: View) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Float]:
+    """The part of an edge that is in the cone of the view: its ends, seen from the viewer, and its interval of t. Where
+    there is none, the ends are equal."""
+    a, b = slot.a - view.p, slot.b - view.p
+    if view.cone is None:
+        return a, b, mi.Float(0), mi.Float(1)
+    cone = view.cone
+    e = b - a
+    # In the cone, off² cos² - along² sin² <= 0 and along > 0. As a function of t, that is A t² + 2 B t + C.
+    a_along, e_along = dr.dot(cone.axis, a), dr.dot(cone.axis, e)
+    a_off, e_off = a - cone.axis * a_along, e - cone.axis * e_along
+    cos2, sin2 = dr.square(cone.cos), dr.square(cone.sin)
+    A = cos2 * dr.squared_norm(e_off) - sin2 * dr.square(e_along)
+    B = cos2 * dr.dot(a_off, e_off) - sin2 * a_along * e_along
+    C = cos2 * dr.squared_norm(a_off) - sin2 * dr.square(a_along)
+    discriminant = B * B - A * C
+    q = -(B + dr.mulsign(dr.safe_sqrt(discriminant), B))
+    roots = q / A, dr.select(q != 0, C / q, 0)
+    first, last = dr.minimum(*roots), dr.maximum(*roots)
+    # A line that is less steep than the cone is inside between the roots; a steeper one beyond one of them.
+    between = A > 0
+    start = dr.select(between, first, dr.select(e_along > 0, last, -dr.inf))
+    end = dr.select(between, last, dr.select(e_along > 0, dr.inf, first))
+    before = -a_along / e_along
+    start = dr.select(between & (e_along > 0), dr.maximum(start, before), start)
+    end = dr.select(between & (e_along < 0), dr.minimum(end, before), end)
+    nothing = between & ((discriminant < 0) | ((e_along == 0) & (a_along < 0)))
+    start, end = dr.clip(start, 0, 1), dr.clip(end, 0, 1)
+    end = dr.select(nothing, start, dr.maximum(start, end))
+    start, end = dr.select(cone.everything, 0, start), dr.select(cone.everything, 1, end)
+    return a + start * e, a + end * e, start, end
 
 
 def _falloff(x: mi.Float) -> mi.Float:
@@ -265,11 +367,12 @@ class _Narrow:
         return _falloff(x * x) / (self.a * self.extent)
 
 
-def _on_line(slot: Slot, view: View) -> list[_Wide | _Narrow]:
-    """Densities on an edge, by length along it, with their weights: that of all directions, and of each lobe."""
-    a, e = slot.a - view.p, slot.b - slot.a
+def _on_line(a: mi.Vector3f, b: mi.Vector3f, view: View) -> list[_Wide | _Narrow]:
+    """Densities on an edge from a to b, as seen from the viewer, by length along it, with their weights: that of all
+    directions, and of each lobe."""
+    e = b - a
     length = dr.norm(e)
-    e /= length
+    e = e / length
     foot = -dr.dot(a, e)
     nearest = dr.maximum(dr.norm(a), dr.norm(a + e * length))
     h = dr.maximum(dr.norm(a + foot * e), 1e-6 * nearest)
@@ -302,8 +405,9 @@ def _narrow(lobe: Lobe, a: mi.Vector3f, e: mi.Vector3f, length: mi.Float, h: mi.
 
 def _sample_point(slot: Slot, view: View, choice: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Parameter t of a point on the edge, and its density."""
-    length = dr.norm(slot.b - slot.a)
-    densities = _on_line(slot, view)
+    a, b, start, end = _in_cone(slot, view)
+    length = dr.norm(b - a)
+    densities = _on_line(a, b, view)
     total = sum(d.total for d in densities)
     s, below = densities[0].sample(u), densities[0].total
     for d in densities[1:]:
@@ -311,4 +415,4 @@ def _sample_point(slot: Slot, view: View, choice: mi.Float, u: mi.Float) -> tupl
         below = below + d.total  # not in place: it is the total of a density
     s = dr.clip(s, 0, length)
     pdf = sum(d.total * d.pdf(s) for d in densities) / total
-    return s / length, pdf * length
+    return dr.lerp(start, end, s / length), pdf * length / (end - start)

@@ -30,8 +30,12 @@ import numpy as np
 from .edge_importance import EdgeSample, Lobe, View, sample_edge
 from .edge_tree import EdgeTree
 from .edges import Edges
+from .emitter_boxes import EmitterBoxes
 from .meshes import Geometry
 from .projection import Projection, inside_frame, tangent
+
+#: Directions sampled from a BSDF, to find its peak.
+CANDIDATES = 8
 
 #: Scattered radiance of a point that a ray meets: called with the ray, what it meets, a sampler, a mask.
 Scattered = Callable[[Any, Any, Any, Any], Any]
@@ -66,7 +70,7 @@ class ShadingBoundary:
     """
 
     _NUMBERS = ("everything", "from_lights_possible", "transmits", "glossy", "emission_from_points")
-    DRJIT_STRUCT = dict.fromkeys(("tree", "moving_shapes", "surface_lights", *_NUMBERS))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("tree", "boxes", "moving_shapes", "surface_lights", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(
         self,
@@ -83,6 +87,7 @@ class ShadingBoundary:
         moves = np.array(moving)[edges.mesh].any(axis=1) if not everything else np.ones(len(edges), bool)
         self.groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         self.tree = EdgeTree(geometry, edges, self.groups)
+        self.boxes = EmitterBoxes(scene, geometry)
         emitters = scene.emitters()
         surface = [i for i, e in enumerate(emitters) if e.flags() & mi.EmitterFlags.Surface]
         self.surface_lights = mi.UInt32(surface or [0])  # Dr.Jit 1.5 cannot freeze empty arrays
@@ -96,7 +101,9 @@ class ShadingBoundary:
 
     def refit(self) -> None:
         """Follow the vertices. To be called before sampling."""
-        self.tree.refit(dr.detach(self.geometry.positions()))
+        positions = dr.detach(self.geometry.positions())
+        self.tree.refit(positions)
+        self.boxes.refit(positions)
 
     # ---------------------- From points ----------------------
 
@@ -105,18 +112,22 @@ class ShadingBoundary:
         scene: mi.Scene,
         si: mi.SurfaceInteraction3f,
         sampler: mi.Sampler,
+        choice: mi.Float,
         active: mi.Bool,
         *,
         share_emission: mi.Bool | bool,
         emission: mi.Bool | bool = True,
+        scattering: mi.Bool | bool = True,
         scattered: Scattered | None = None,
     ) -> mi.Spectrum:
-        """One sample of the boundary integral at each of `si`.
+        """One sample of the boundary integral at each of `si`: of the light that a light emits, or of light that is
+        scattered.
 
         si : attached to whatever moves it.
+        choice : see `sample_edge`.
         share_emission : where lights of finite size are sampled from the lights, too.
         emission : where emitted light counts at all.
-        scattered : where given, scattered light counts.
+        scattering, scattered : where scattered light counts, and what it is; None: nowhere.
 
         Returns
         -------
@@ -128,40 +139,56 @@ class ShadingBoundary:
             for shape in self.moving_shapes:
                 moves |= si.shape == shape
             active = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+
+            # ---------------------- Emitted light, or scattered ----------------------
+
+            emission, scattering = mi.Bool(emission), mi.Bool(scattering) & (scattered is not None)
+            active &= emission | scattering
+            # Emitted light is sought in the directions of one light, scattered light everywhere.
+            p = dr.select(emission, dr.select(scattering, 0.5, 1), 0)
+            emission = sampler.next_1d(active) < p
+            light, light_weight, _ = scene.sample_emitter(sampler.next_1d(active), active)
+            cone = self.boxes.cone(light, si.p)
+            cone.cos = dr.select(emission, cone.cos, -1)
+            light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), light, active)
+
+            # ---------------------- An edge ----------------------
+
             facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
             view = View(
                 mi.Vector3f(si.p - self.tree.centre),
                 facing,
                 dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), dr.inv_pi, 0.1 * dr.inv_pi),
-                self._lobes(scene, si, bsdf, sampler, active, scattered is not None),
+                [self._lobe(si, bsdf, sampler, active)] if self.glossy else [],
+                cone,
             )
             use = [1, dr.select(moves, 1, 0)] if len(self.groups) == 2 else [1]
-            e = sample_edge(self.tree, view, sampler, use, from_light=False, active=active)
-        weight = (lambda a, b: dr.select(share_emission, _share(b, a), 1)) if self.from_lights_possible else None
-        return self._evaluate(scene, si, e, sampler, active, weight, emission=emission, scattered=scattered)
+            e = sample_edge(self.tree, view, sampler, use, choice=choice, from_light=False, active=active)
+            e.density *= dr.select(emission, p / light_weight, 1 - p)
+        share = (lambda a, b: dr.select(share_emission, _share(b, a), 1)) if self.from_lights_possible else None
+        return self._evaluate(scene, si, e, sampler, active, light, share, emission=emission, scattered=scattered)
 
-    def _lobes(self, scene, si, bsdf, sampler, active, towards_lights: bool) -> list[Lobe]:
-        """Around which directions to look for edges more closely: one that is sampled from the BSDF, and one towards a
-        light.
+    @staticmethod
+    def _lobe(si, bsdf, sampler, active) -> Lobe:
+        """Around which direction the BSDF is most reflective: of a few directions that are sampled from it, that of the
+        highest density.
 
-        Since lobes only guide the choice, they may be as random as this; and nothing about a BSDF must be known but
-        how to sample it.
+        Since it only guides the choice, it may be as random as this; and nothing about a BSDF must be known but how to
+        sample it.
         """
-        lobes = []
-        # As wide as a lobe of that density.
-        width = lambda pdf: dr.clip(dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-3)), 1e-5, 1)
-        if self.glossy:
+
+        def draw(k, axis, pdf, sampler):
             bs, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
-            found = active & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            axis = dr.select(found, si.to_world(bs.wo), mi.Vector3f(0, 0, 1))
-            lobes.append(Lobe(axis, dr.select(found, bs.pdf, 0), width(bs.pdf)))
-        if self.from_lights_possible and towards_lights:
-            light, _ = scene.sample_emitter_direction(si, sampler.next_2d(active), False, active)
-            found = active & (light.pdf > 0) & ~light.delta
-            axis = dr.select(found, light.d, mi.Vector3f(0, 0, 1))
-            # An edge across the light then counts about as much as all others together.
-            lobes.append(Lobe(axis, dr.select(found, 0.5 / width(light.pdf), 0), width(light.pdf)))
-        return lobes
+            better = active & (bs.pdf > pdf) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            return k + 1, dr.select(better, bs.wo, axis), dr.select(better, bs.pdf, pdf), sampler
+
+        width = dr.width(si.p)
+        axis = dr.zeros(mi.Vector3f, width)
+        axis.z = 1
+        state = (dr.zeros(mi.UInt32, width), axis, dr.zeros(mi.Float, width), sampler)
+        _, axis, pdf, _ = dr.while_loop(state, lambda k, *_: active & (k < CANDIDATES), draw, label="peak of a BSDF")
+        # As wide as a lobe of that density.
+        return Lobe(si.to_world(axis), pdf, dr.clip(dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-3)), 1e-5, 1))
 
     # ---------------------- From lights ----------------------
 
@@ -194,7 +221,9 @@ class ShadingBoundary:
             view = View(mi.Vector3f(y.p - self.tree.centre), y.n, dr.full(mi.Float, 1, count), [])
             # Shadows of edges that stand still matter only on what moves.
             use = [1, 0.2][: len(self.groups)]
-            e = sample_edge(self.tree, view, sampler, use, from_light=True, active=active)
+            choice = (dr.arange(mi.Float, count) + sampler.next_1d()) / count
+            choice = dr.minimum(choice, dr.one_minus_epsilon(mi.Float))
+            e = sample_edge(self.tree, view, sampler, use, choice=choice, from_light=True, active=active)
             active &= e.density > 0
             positions = dr.detach(self.geometry.positions())
             a, b = self.tree.device_edges.end_points(positions, e.edge)
@@ -258,7 +287,7 @@ class ShadingBoundary:
             active &= dr.isfinite(e.density) & (e.density > 0)
 
         share = _share if self.emission_from_points else None
-        value = self._evaluate(scene, si, e, sampler, active, share, target=(emitter, y))
+        value = self._evaluate(scene, si, e, sampler, active, emitter, share, target=y)
         with dr.resume_grad():
             return LightSamples(u, value * ray_weight, ray.wavelengths)
 
@@ -271,16 +300,19 @@ class ShadingBoundary:
         sample: EdgeSample,
         sampler: mi.Sampler,
         active: mi.Bool,
-        emission_weight: Callable[[mi.Float, mi.Float], mi.Float] | None,
+        light: mi.EmitterPtr,
+        share: Callable[[mi.Float, mi.Float], mi.Float] | None,
         *,
         emission: mi.Bool | bool = True,
         scattered: Scattered | None = None,
-        target: tuple[mi.EmitterPtr, mi.PositionSample3f] | None = None,
+        target: mi.PositionSample3f | None = None,
     ) -> mi.Spectrum:
         """What a point on an edge does to the light that is reflected at `si`.
 
-        emission_weight : weight of emitted light, of the densities of its direction by light and by BSDF sampling.
-        target : only this emitter counts, at this point of it.
+        light : the only one whose emission counts.
+        share : weight of emitted light, of the densities of its direction by light and by BSDF sampling.
+        emission : does emitted light count, or scattered light?
+        target : only this point of the light counts.
         """
         edges = self.tree.device_edges
         with dr.resume_grad():
@@ -297,8 +329,8 @@ class ShadingBoundary:
             seen = ω
             if target is not None:
                 # `path` reckons the geometry of light samples from the surface itself.
-                d, lifted = target[1].p - si.p, target[1].p - x
-                seen, n = dr.normalize(d), target[1].n
+                d, lifted = target.p - si.p, target.p - x
+                seen, n = dr.normalize(d), target.n
                 ratio = dr.squared_norm(lifted) / dr.squared_norm(d)
                 n_dl *= ratio * dr.sqrt(ratio) * dr.dot(n, d) / dr.dot(n, lifted)
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(seen), active)
@@ -312,24 +344,25 @@ class ShadingBoundary:
                 ray = si.spawn_ray(dr.normalize(beside - x))
             else:
                 # From x to the edge, nothing is in the way: that has been seen already.
-                ray = mi.Ray3f(beside, dr.normalize(target[1].p - beside), si.time, si.wavelengths)
+                ray = mi.Ray3f(beside, dr.normalize(target.p - beside), si.time, si.wavelengths)
             pi = scene.ray_intersect_preliminary(ray, active=active)
             if target is None:
                 # Something before the edge hides it. (A surface on which it lies may be met just before it.)
                 active &= ~pi.is_valid() | (pi.t >= distance * (1 - 1e-3))
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             emitter = y.emitter(scene, active)
-            lit = active & emission & (emitter != None)  # noqa: E711 (an array of pointers)
+            lit = active & emission & (emitter == light)
             if target is not None:
-                lit &= (emitter == target[0]) & (dr.norm(y.p - target[1].p) <= 1e-3 * pi.t)
+                lit &= dr.norm(y.p - target.p) <= 1e-3 * pi.t
             L = emitter.eval(y, lit)
-            if emission_weight is not None:
+            if share is not None:
                 on_surface = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
                 light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), on_surface)
-                L *= dr.select(on_surface, emission_weight(light_pdf, pdf), 1)
+                L *= dr.select(on_surface, share(light_pdf, pdf), 1)
             valid = active & y.is_valid()
             if scattered is not None:
-                L += dr.select(valid, scattered(ray, pi, sampler, valid), 0)
+                reflected = valid & ~emission
+                L += dr.select(reflected, scattered(ray, pi, sampler, reflected), 0)
             L = dr.select(active, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)
             if self.everything:

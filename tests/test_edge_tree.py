@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from scipy.stats import chisquare
 
 from rimlight.edge_sampling import Edges, Geometry, find_edges
-from rimlight.edge_sampling.edge_importance import Lobe, View, sample_edge
+from rimlight.edge_sampling.edge_importance import Cone, Lobe, View, sample_edge
 from rimlight.edge_sampling.edge_tree import LEAF, EdgeTree
 
 # ---------------------- Meshes and trees ----------------------
@@ -226,9 +226,18 @@ def test_a_mesh_of_points_has_no_boundaries():
 
 
 def draw(
-    setup: Setup, p, count: int, *, n=(0, 0, 0), wide: float = 1, lobes=(), use=None, from_light: bool = False
+    setup: Setup,
+    p,
+    count: int,
+    *,
+    n=(0, 0, 0),
+    wide: float = 1,
+    lobes=(),
+    cone=None,
+    use=None,
+    from_light: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges, parameters and densities of samples as seen from p. Lobes are (axis, peak, width)."""
+    """Edges, parameters and densities of samples as seen from p. Lobes are (axis, peak, width), cones (axis, angle)."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, count)
     # Opaque: all views share one kernel.
@@ -236,9 +245,13 @@ def draw(
     vector = lambda v: mi.Vector3f(*map(number, v))
     p = vector(p - np.array(setup.tree.centre).ravel())
     lobes = [Lobe(vector(axis), number(peak), number(width)) for axis, peak, width in lobes]
-    view = View(p, vector(n), number(wide), lobes)
+    if cone is not None:
+        axis, angle = cone
+        cone = Cone(vector(axis), number(np.cos(angle)), number(np.sin(angle)))
+    view = View(p, vector(n), number(wide), lobes, cone)
     use = use or [True] * len(setup.tree.depths)
-    e = sample_edge(setup.tree, view, sampler, use, from_light=from_light, active=mi.Bool(True))
+    choice = sampler.next_1d()
+    e = sample_edge(setup.tree, view, sampler, use, choice=choice, from_light=from_light, active=mi.Bool(True))
     dr.eval(e)
     return np.array(e.edge), np.array(e.t, float), np.array(e.density, float)
 
@@ -319,6 +332,45 @@ def test_groups_are_sampled_where_they_are_wanted(from_light):
     samples = draw(setup, p, count, use=[True, mi.Bool(both)], from_light=from_light)
     assert_unbiased(setup, p, samples, both)
     assert_unbiased(setup, p, samples, ~both, slice(first, None))
+
+
+CONES = {
+    "narrow": ("bumpy", (4, 1, 0.5), (unit(-1, 0, -0.1), 0.05), {}),
+    "wide": ("bumpy", (1.3, 0, 0.2), (unit(0, 0.9, -0.3), 0.9), {}),
+    "near": ("bumpy", (1.3, 0, 0.2), (unit(-0.5, 0.5, -0.3), 0.3), {}),
+    "over long edges": ("still life", (0, 2, -4), (unit(0.1, -0.2, 1), 0.2), {}),
+    "along long edges": ("still life", (-4, 3.02, 0.02), (unit(1, -0.05, 0), 0.25), {}),
+    "with a lobe": ("bumpy", (4, 1, 0.5), (unit(-1, -0.2, 0), 0.2), {"lobes": [(unit(-1, -0.2, 0), 20, 0.05)]}),
+    "around a point in the mesh": ("bumpy", (0.8, 0.8, 0.8), (unit(-1, 0.1, 0.3), 1.2), {}),
+}
+
+
+@pytest.mark.parametrize(("scene", "p", "cone", "options"), CONES.values(), ids=CONES)
+def test_all_of_a_cone_is_sampled_and_nothing_else(scenes, scene, p, cone, options):
+    """The mean of 1 / density is the part of the edge that is in the cone."""
+    setup, count = scenes[scene], 2**19
+    edge, t, density = draw(setup, p, count, cone=cone, **options)
+    hit = density > 0
+    a, b = setup.end_points()
+    axis, angle = cone
+
+    def off(points):
+        d = points - np.array(p)
+        return np.arccos(np.clip(d @ axis / np.linalg.norm(d, axis=-1), -1, 1))
+
+    at = a[edge[hit]] + t[hit, None] * (b - a)[edge[hit]]
+    assert off(at).max() <= angle + 1e-3
+    boundary, ambiguous = setup.boundaries(p)
+    assert (boundary | ambiguous)[edge[hit]].all()
+    s = (np.arange(4000) + 0.5) / 4000
+    part = np.array([(off(a[e] + s[:, None] * (b - a)[e]) <= angle).mean() for e in range(len(a))])
+    weight = np.divide(1, density, where=hit, out=np.zeros(count))
+    mean, square = (np.bincount(edge, weight**k, minlength=len(a)) / count for k in (1, 2))
+    inside = boundary & ~ambiguous & (part > 0)
+    assert inside.sum() >= 2
+    assert np.bincount(edge[hit], minlength=len(a))[inside].min() >= 20
+    error = np.sqrt((square - mean**2)[inside] / count)
+    assert (np.abs(mean - part)[inside] <= 4.5 * error + 1 / 4000).all()
 
 
 def test_what_is_behind_the_plane_is_not_sampled(scenes):

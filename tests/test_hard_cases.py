@@ -227,7 +227,7 @@ def test_points_on_the_lines_of_edges():
         assert dr.all(dr.norm(si.p - target) < 1e-6)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(x) * count)
-    L = shading.from_points(scene, si, sampler, mi.Bool(True), share_emission=False)
+    L = shading.from_points(scene, si, sampler, sampler.next_1d(), mi.Bool(True), share_emission=False)
     derivative = np.array(dr.forward_to(L, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
     assert np.isfinite(derivative).all()
     seen = (derivative.reshape(3, len(x), count) != 0).any((0, 2))

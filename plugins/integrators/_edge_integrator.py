@@ -19,6 +19,7 @@ from rimlight.edge_sampling import (
     find_edges,
     intersecting_meshes,
     jumping_textures,
+    stratified,
 )
 
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
@@ -232,7 +233,7 @@ class EdgeIntegrator(ADIntegrator):
         L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=True)
         return L, dr.select(valid, mi.Float(1), 0)
 
-    def _seen_from_vertex(self, scene, sampler, ray, shading: ShadingBoundary) -> mi.Spectrum:
+    def _seen_from_vertex(self, scene, sampler, choice, ray, shading: ShadingBoundary) -> mi.Spectrum:
         """What edges do to the light that a vertex of each path reflects: mi.Spectrum, (N,), zero, with a gradient."""
         pi = self._first_hit(scene, ray, True)
         first = self._camera_vertex(ray, pi)
@@ -251,9 +252,11 @@ class EdgeIntegrator(ADIntegrator):
             scene,
             si,
             sampler,
+            choice,
             chosen,
             share_emission=at_first & shading.from_lights_possible,
             emission=~at_first | shading.emission_from_points,
+            scattering=self.depths.scatters(vertex.depth + 1),
             scattered=scattered,
         )
         with dr.resume_grad():
@@ -317,9 +320,11 @@ class EdgeIntegrator(ADIntegrator):
 
     def _from_points(self, scene, sensor, seed, sppi, weights, shading: ShadingBoundary) -> Term:
         """Boundaries as seen from one vertex of each path."""
-        sampler, sppi = self._sampler(sensor, 0x55555555 ^ seed, sppi)
+        seed = 0x55555555 ^ seed
+        sampler, sppi = self._sampler(sensor, seed, sppi)
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
-        L = self._seen_from_vertex(scene, sampler, ray, shading)
+        choice = stratified(sampler, seed)
+        L = self._seen_from_vertex(scene, sampler, choice, ray, shading)
         with dr.resume_grad():
             return Term(position, Sample(L * ray_weight * (weights / sppi), mi.Float(0)), ray.wavelengths, 0.0, sppi)
 
