@@ -16,6 +16,7 @@ from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
+import normal_cones
 import numpy as np
 from _bench import (
     EQUAL_TIME_SPP,
@@ -38,6 +39,10 @@ from _bench import (
     table,
 )
 
+from rimlight.edge_sampling import Geometry, find_edges
+from rimlight.edge_sampling.edge_importance import View, sample_edge
+from rimlight.edge_sampling.edge_tree import EdgeTree
+
 OURS, PEER = "direct_edge", "direct_projective"
 METHODS = {OURS: {"type": OURS}, PEER: {"type": PEER}}
 
@@ -50,6 +55,10 @@ PEER_SPP = {"glossy_receiver": (4, 64), "mirror_receiver": (4,)}
 ROUGHNESS = (0.0005, 0.003, 0.02, 0.1, 0.3)
 PICTURE_RES, PICTURE_SPP, PICTURE_SECONDS = 128, 16, 4.0
 BUNNY = cases.REDNER.parent / "redner" / "bunny_box_bunny_target.ply"
+CHOICES = ("uniformly", "by normal cones", "without lobes", "by importance")
+#: From where single choices are judged: radii around the middle of a mesh, and points at each.
+DISTANCES = {"far": 4.0, "near": 1.15}
+POINTS = 18
 
 
 def against_reference(name: str, settings: Settings, _: Path) -> dict[str, Any]:
@@ -75,11 +84,16 @@ def roughness(settings: Settings, _: Path) -> dict[str, Any]:
 # ---------------------- With and without importance sampling of edges ----------------------
 
 
-def mirrored_object() -> mi.Scene:
-    """A rough mirror that shows a closed mesh of many edges: a bunny, or a bumpy ball."""
-    shape = bumpy_ball(64, "object")
+def many_edges() -> mi.Mesh:
+    """A closed mesh: a bunny, or a bumpy ball."""
     if BUNNY.exists():
-        shape = mi.load_dict({"type": "ply", "filename": str(BUNNY)})
+        return mi.load_dict({"type": "ply", "filename": str(BUNNY)})
+    return bumpy_ball(64, "object")
+
+
+def mirrored_object() -> mi.Scene:
+    """A rough mirror that shows a closed mesh of many edges."""
+    shape = many_edges()
     p, faces = (np.array(mi.traverse(shape)[key]).reshape(-1, 3) for key in ("vertex_positions", "faces"))
     p = (p - (p.min(0) + p.max(0)) / 2) / np.ptp(p, axis=0).max() * 1.5 + np.array([0.1, 1.9, 0.9])
     return cases.scene(
@@ -92,7 +106,8 @@ def mirrored_object() -> mi.Scene:
 
 @contextlib.contextmanager
 def edges_chosen(how: str) -> Iterator[None]:
-    """Replace the choice of edges: "uniformly" by length, "without lobes" by the tree without the BSDF's lobes."""
+    """Replace the choice of edges: "uniformly" by length, "by normal cones" instead of moments, "without lobes" by the
+    tree without the BSDF's lobes."""
     module = import_module("rimlight.edge_sampling.edge_importance")
     boundary = import_module("rimlight.edge_sampling.shading_boundary").ShadingBoundary
     with contextlib.ExitStack() as stack:
@@ -101,7 +116,10 @@ def edges_chosen(how: str) -> Iterator[None]:
             patch(module, "importance", lambda node, *_: node.always + node.silhouettes)
             patch(module, "edge_importance", lambda slot, *_: dr.norm(slot.b - slot.a))
             patch(module, "_sample_point", lambda *args: (args[-1], mi.Float(1)))
-        if how != "by importance":
+        if how == "by normal cones":
+            for replacement in normal_cones.replacements():
+                patch(*replacement)
+        if how in ("uniformly", "without lobes"):
             patch(boundary, "_lobes", lambda *_: [])
         yield
 
@@ -116,7 +134,7 @@ def equal_time_picture(settings: Settings, folder: Path) -> dict[str, Any]:
     problem = Problem("mirrored object", scene, motion, {OURS: METHODS[OURS]})
     problem.truth, error = problem.mean_of(OURS, 128, range(1000, 1004 if settings.quick else 1010))
     panels, found = [Panel(np.array(mi.render(scene, spp=256, integrator=problem.path)), "image")], []
-    for how in ("uniformly", "without lobes", "by importance"):
+    for how in CHOICES:
         with edges_chosen(how):
             one = median_seconds(lambda seed: problem.derivative(OURS, PICTURE_SPP, seed), 3)
             spp, renders = PICTURE_SPP, max(1, round((0.3 if settings.quick else PICTURE_SECONDS) / one))
@@ -137,6 +155,40 @@ def equal_time_picture(settings: Settings, folder: Path) -> dict[str, Any]:
     return {"choices": found, "edges": edges, "truth_error": noise}
 
 
+def single_choices(settings: Settings, _: Path) -> dict[str, Any]:
+    """Weights of edges that are chosen from random points around a mesh: length over distance, over density."""
+    geometry = Geometry((many_edges(),), ())
+    edges, positions = find_edges(geometry), geometry.positions()
+    p = geometry.host_positions()
+    middle = p.mean(0)
+    radius, found = np.linalg.norm(p - middle, axis=1).max(), []
+    for how in ("uniformly", "by normal cones", "by importance"):
+        with edges_chosen(how):
+            tree = EdgeTree(geometry, edges, [np.arange(len(edges))])
+            tree.refit(positions)
+            row, random = {"how": how}, np.random.default_rng(0)
+            for name, distance in DISTANCES.items():
+                d = random.normal(size=(3 if settings.quick else POINTS, 3))
+                eyes = middle + distance * radius * d / np.linalg.norm(d, axis=1, keepdims=True)
+                weights = np.array([_weights(tree, positions, eye, seed) for seed, eye in enumerate(eyes)])
+                row[name] = float(((weights**2).mean(1) / weights.mean(1) ** 2).mean())
+                row[f"{name}_hits"] = float((weights > 0).mean())
+            found.append(row)
+    return {"edges": len(edges), "points": len(d), "choices": found}
+
+
+def _weights(tree: EdgeTree, positions: mi.Float, eye: np.ndarray, seed: int, count: int = 200_000) -> np.ndarray:
+    """Of edges as seen from a point; 0 where they are no boundaries."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count)
+    eye = mi.Point3f(*(dr.opaque(mi.Float, float(x), count) for x in eye))
+    view = View(mi.Vector3f(eye - tree.centre), mi.Vector3f(0), dr.full(mi.Float, 1, count), [])
+    e = sample_edge(tree, view, sampler, [1], from_light=False, active=mi.Bool(True))
+    a, b = tree.device_edges.end_points(positions, e.edge)
+    hit = (e.density > 0) & tree.device_edges.is_boundary(positions, e.edge, eye)
+    return np.array(dr.select(hit, dr.norm(b - a) / dr.norm(dr.lerp(a, b, e.t) - eye) / e.density, 0), float)
+
+
 # ---------------------- Report ----------------------
 
 
@@ -149,7 +201,9 @@ def report(found: dict[str, Any]) -> list[str]:
         lines += [
             f"A mesh that a rough mirror shows, {case['edges']} edges in the scene, {PICTURE_RES} × {PICTURE_RES} "
             "pixels, the same time for each way to choose an edge. The truth is a mean of many renders with importance "
-            f"sampling; its own noise is {percent(case['truth_error'])}.",
+            f"sampling; its own noise is {percent(case['truth_error'])}. *By normal cones*: a node, or an edge in a "
+            "leaf, counts with its whole length, unless a cone around its face normals shows that it has no "
+            "silhouettes. The weights of directions are the same.",
             *table(
                 {
                     "<edges chosen": lambda c: c["how"],
@@ -161,6 +215,24 @@ def report(found: dict[str, Any]) -> list[str]:
                 case["choices"],
             ),
             "",
+        ]
+    if "single_choices" in found:
+        case = found["single_choices"]
+        lines += [
+            f"Choices judged one by one: a mesh of {case['edges']} edges, seen from {case['points']} random points at "
+            f"each of {DISTANCES['far']:g} and {DISTANCES['near']:g} radii around its middle. How many samples are "
+            "boundaries as seen from there; and the second moment of length over distance, divided by the density of "
+            "the choice, in units of the squared mean (1 is perfect).",
+            *table(
+                {
+                    "<edges chosen": lambda c: c["how"],
+                    "boundaries, far": lambda c: percent(c["far_hits"]),
+                    "near": lambda c: percent(c["near_hits"]),
+                    "second moment, far": lambda c: f"{c['far']:.2f}",
+                    "near ": lambda c: f"{c['near']:.2f}",
+                },
+                case["choices"],
+            ),
         ]
     if "roughness" in found:
         lines += [
@@ -203,6 +275,7 @@ if __name__ == "__main__":
                 **{name: partial(against_reference, name) for name in NOTES},
                 "roughness": roughness,
                 "choice": equal_time_picture,
+                "single_choices": single_choices,
             },
             report=report,
             plot=plot,

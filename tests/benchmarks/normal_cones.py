@@ -1,0 +1,86 @@
+"""Edges chosen by cones of normals: the classical test for silhouettes, to compare the moments of planes with.
+
+A node is rejected where the cone around its face normals, as seen over the whole of its bounding sphere, turns all
+faces to the viewer, or all away. Otherwise it counts with its whole length, times the weights of distance, BSDF and
+lobes that the choice by importance uses, too. An edge in a leaf is a node like any other: it passes by its cone, and
+may turn out to be no silhouette once it is chosen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rimlight.edge_sampling import edge_importance
+from rimlight.edge_sampling.edge_importance import View, importance
+from rimlight.edge_sampling.edge_tree import LEAF, EdgeTree, Node, Slot
+
+#: Radians by which a cone is wider than its normals: rounding must not reject.
+SLACK = 1e-3
+
+
+def replacements() -> list[tuple[Any, str, Any]]:
+    """What to replace so that edges are chosen by cones: (of what, attribute, by what)."""
+    refit, node = EdgeTree.refit, EdgeTree.node
+
+    def refit_with_cones(tree: EdgeTree, positions: mi.Float) -> None:
+        refit(tree, positions)
+        # The scenes of the benchmarks stand still: once is enough.
+        if not hasattr(tree, "cones"):
+            tree.cones = mi.Float(cones(tree).ravel())
+
+    def node_with_cone(tree: EdgeTree, index: mi.UInt32, active: mi.Bool | bool = True) -> Node:
+        found = node(tree, index, active)
+        found.cone = dr.gather(mi.Vector4f, tree.cones, index, active)
+        return found
+
+    return [
+        (EdgeTree, "refit", refit_with_cones),
+        (EdgeTree, "node", node_with_cone),
+        (edge_importance, "importance", _importance),
+        (edge_importance, "edge_importance", _edge_importance),
+    ]
+
+
+def cones(tree: EdgeTree) -> np.ndarray:
+    """(nodes, 4): around the face normals of each node, a unit vector and the largest angle to it, radians."""
+    p, q, a, b = (np.array(packet, float).reshape(-1, 4)[:, :3] for packet in tree.slots)
+    normals = np.stack([p, q], 1) * (a != b).any(1)[:, None, None]  # zero in slots without an edge
+    found = np.zeros((tree.node_offsets[-1], 4), np.float32)
+    for depth, first, leaf in zip(tree.depths, tree.node_offsets, tree.leaf_offsets, strict=False):
+        for level in range(depth + 1):
+            n = normals[leaf * LEAF :][: 2**depth * LEAF].reshape(2**level, -1, 3)
+            axis = n.sum(1)
+            axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
+            cosine = np.where(n.any(2), np.einsum("ijk,ik->ij", n, axis), 1).min(1)
+            found[first + 2**level :][: 2**level] = np.c_[axis, np.arccos(np.clip(cosine, -1, 1))]
+    return found
+
+
+def _importance(node: Node, view: View, from_light: bool) -> mi.Float:
+    lower, upper = mi.Vector3f(node.lower), mi.Vector3f(node.upper)
+    d = 0.5 * (lower + upper) - view.p
+    distance, radius = dr.norm(d), 0.5 * dr.norm(upper - lower)
+    # Angles between the axis and the planes across the line of sight, and of the sphere as it is seen.
+    off = dr.abs(dr.safe_asin(dr.dot(node.cone.xyz, d) / distance))
+    sphere = dr.safe_asin(radius / distance)
+    possible = (off <= node.cone.w + sphere + SLACK) | (distance <= radius)
+    length = node.always + dr.select(possible, node.silhouettes, 0)
+    # The weights alone: what is always a boundary passes all else.
+    return importance(
+        replace(node, silhouettes=mi.Float(0), always=length, plane_lower=[-1] * 4, plane_upper=[1] * 4),
+        view,
+        from_light,
+    )
+
+
+def _edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
+    n, m = (plane.xyz for plane in slot.planes)
+    node = EdgeTree._single(slot)
+    axis = (n + m) * dr.rsqrt(dr.maximum(dr.squared_norm(n + m), 1e-12))
+    node.cone = mi.Vector4f(axis.x, axis.y, axis.z, dr.safe_asin(0.5 * dr.norm(n - m)))
+    return _importance(node, view, from_light)
