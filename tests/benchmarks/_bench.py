@@ -48,19 +48,21 @@ class Settings:
     calls : at most and at least so many timed calls of a method, each with a seed of its own.
     seconds : no further call of a method after so long, but for the least.
     trials : of the comparison at equal time.
+    values : of pixels, at least so many, from which outliers are known.
     """
 
     quick: bool = False
     calls: tuple[int, int] = (32, 2)
     seconds: float = 4.0
     trials: int = 4
+    values: int = 1_000_000
 
     def pick(self, values: Iterable[Any], quick: int = 1) -> tuple[Any, ...]:
         """All values, or the first ones of them in a quick run."""
         return tuple(values)[:quick] if self.quick else tuple(values)
 
 
-QUICK = Settings(quick=True, calls=(2, 2), seconds=1.0, trials=1)
+QUICK = Settings(quick=True, calls=(2, 2), seconds=1.0, trials=1, values=20_000)
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,24 @@ class EqualTime:
     relative_l1: float
     method: str = "direct_edge"
     efficiency_ratio: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Absolute pixel values of derivative images of one sample per pixel, in units of their mean.
+
+    values : how many, of pixels, channels, and renders.
+    high : the 99.99th percentile.
+    largest : of them all.
+    reference : the largest of the reference, in units of its own mean.
+    """
+
+    scene: str
+    method: str
+    values: int
+    high: float
+    largest: float
+    reference: float
 
 
 # ---------------------- Measuring (in a process for each case) ----------------------
@@ -264,6 +284,15 @@ class Problem:
             efficiency=1 / (self.mse(images) * median),
         )
 
+    def outliers(self, method: str, settings: Settings) -> Outliers:
+        """One sample per pixel: a single bright or dark one is not hidden by others."""
+        renders = -(-settings.values // self.truth.size)
+        values = np.abs([self.timed(method, 1, seed)[0] for seed in range(renders)])
+        high, largest = np.quantile(values, (0.9999, 1)) / values.mean()
+        say(f"{self.name}, {method}, outliers: {high:.4g}, {largest:.4g}")
+        truth = np.abs(self.truth)
+        return Outliers(self.name, method, values.size, float(high), float(largest), float(truth.max() / truth.mean()))
+
     def equal_time(self, ours: str, peer: str, rows: list[Row], settings: Settings) -> EqualTime:
         """As many samples of `ours`, in as few renders, as take about as long as the peer."""
         row = {r.method: r for r in rows if r.spp == EQUAL_TIME_SPP}
@@ -377,6 +406,28 @@ def equal_time_table(found: list[dict[str, Any]]) -> list[str]:
     if all(np.isfinite(e.efficiency_ratio) for e in known):
         columns["efficiency ratio"] = lambda e: f"{e.efficiency_ratio:.3g}"
     return table(columns, known)
+
+
+def outliers_text(found: Iterable[dict[str, Any]]) -> list[str]:
+    """found : results of cases; those without outliers are left out."""
+    known = [Outliers(**case["outliers"]) for case in found if "outliers" in case]
+    if not known:
+        return []
+    return [
+        "Rare bright and dark pixels: absolute values of derivative images at 1 sample per pixel, over their mean. "
+        "Where few pixels have a derivative at all, these are large in the reference, too; beyond that, it is noise.",
+        *table(
+            {
+                "<scene": lambda o: o.scene,
+                "<method": lambda o: code(o.method),
+                "pixel values": lambda o: f"{o.values:.2g}",
+                "99.99th percentile / mean": lambda o: f"{o.high:.3g}",
+                "largest / mean": lambda o: f"{o.largest:.3g}",
+                "of the reference": lambda o: f"{o.reference:.3g}",
+            },
+            known,
+        ),
+    ]
 
 
 def rows_table(found: list[dict[str, Any]]) -> list[str]:

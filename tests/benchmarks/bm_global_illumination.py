@@ -29,6 +29,7 @@ from _bench import (
     figure,
     main,
     median_seconds,
+    outliers_text,
     plot_errors,
     save,
     say,
@@ -60,7 +61,12 @@ def against_reference(name: str, settings: Settings, _: Path) -> dict[str, Any]:
     rows = []
     for spp in settings.pick((4, 16, 64, 256, 1024)):
         rows += problem.rows(spp, (OURS, PEER) if spp in peer_spp else (OURS,), settings)
-    return {"rows": rows, "equal_time": [problem.equal_time(OURS, PEER, rows, settings)], "reference": problem.facts()}
+    return {
+        "rows": rows,
+        "equal_time": [problem.equal_time(OURS, PEER, rows, settings)],
+        "outliers": problem.outliers(OURS, settings),
+        "reference": problem.facts(),
+    }
 
 
 def depth(settings: Settings, _: Path) -> dict[str, Any]:
@@ -222,6 +228,7 @@ def report(found: dict[str, Any]) -> list[str]:
     compared = [s for key, case in found.items() if key.startswith("redner_") for s in case["scenes"]]
     if compared:
         lines += _redner_text(compared)
+    lines += outliers_text(found[name] for name in NOTES if name in found)
     for name in NOTES:
         if name in found:
             lines += case_text(name, found[name], NOTES[name])

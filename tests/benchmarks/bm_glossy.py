@@ -32,6 +32,7 @@ from _bench import (
     figure,
     main,
     median_seconds,
+    outliers_text,
     percent,
     plot_errors,
     save,
@@ -66,7 +67,12 @@ def against_reference(name: str, settings: Settings, _: Path) -> dict[str, Any]:
     rows = []
     for spp in settings.pick((4, 16, 64, 256, 1024)):
         rows += problem.rows(spp, (OURS, PEER) if spp in PEER_SPP[name] else (OURS,), settings)
-    return {"rows": rows, "equal_time": [problem.equal_time(OURS, PEER, rows, settings)], "reference": problem.facts()}
+    return {
+        "rows": rows,
+        "equal_time": [problem.equal_time(OURS, PEER, rows, settings)],
+        "outliers": problem.outliers(OURS, settings),
+        "reference": problem.facts(),
+    }
 
 
 def roughness(settings: Settings, _: Path) -> dict[str, Any]:
@@ -247,6 +253,7 @@ def report(found: dict[str, Any]) -> list[str]:
                 found["roughness"]["rows"],
             ),
         ]
+    lines += outliers_text(found[name] for name in NOTES if name in found)
     for name in NOTES:
         if name in found:
             lines += case_text(name, found[name], NOTES[name])

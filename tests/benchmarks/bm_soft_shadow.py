@@ -23,6 +23,7 @@ from _bench import (
     equal_time_table,
     figure,
     main,
+    outliers_text,
     percent,
     plot_errors,
     save,
@@ -48,7 +49,12 @@ def against_reference(name: str, settings: Settings, _: Path) -> dict[str, Any]:
     for spp in settings.pick((4, 16, 64, 256, 1024)):
         # The peer's time hardly depends on it.
         rows += problem.rows(spp, (OURS, PEER) if spp in (4, 64, 1024) else (OURS,), settings)
-    return {"rows": rows, "equal_time": [problem.equal_time(OURS, PEER, rows, settings)], "reference": problem.facts()}
+    return {
+        "rows": rows,
+        "equal_time": [problem.equal_time(OURS, PEER, rows, settings)],
+        "outliers": problem.outliers(OURS, settings),
+        "reference": problem.facts(),
+    }
 
 
 def large(settings: Settings, _: Path) -> dict[str, Any]:
@@ -104,6 +110,7 @@ def report(found: dict[str, Any]) -> list[str]:
                 found["light_size"]["sizes"],
             ),
         ]
+    lines += outliers_text(found[name] for name in NOTES if name in found)
     for name in NOTES:
         if name in found:
             lines += case_text(name, found[name], NOTES[name])
