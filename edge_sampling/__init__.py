@@ -1,6 +1,6 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
-from .edge_importance import Cone, EdgeSample, Lobe, View, sample_edge, stratified
+from .edge_importance import Cone, EdgeSample, Lobe, View, resample, sample_edge, stratified
 from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, find_edges
 from .film_boundary import BoundarySamples, FilmBoundary
@@ -33,6 +33,7 @@ __all__ = [
     "intersecting_meshes",
     "jumping_textures",
     "mean_and_error",
+    "resample",
     "sample_edge",
     "stratified",
     "z_scores",

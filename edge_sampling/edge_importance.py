@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -168,6 +169,45 @@ def sample_edge(
     t, pdf = _sample_point(tree.slot(slot, alive), view, which, choice)
     density = dr.select(alive, density * weight / total * pdf, 0)
     return EdgeSample(dr.gather(mi.UInt32, tree.slot_edge, slot, alive), t, dr.select(dr.isfinite(density), density, 0))
+
+
+def resample(
+    draw: Callable[[mi.Float, mi.Sampler], EdgeSample],
+    target: Callable[[EdgeSample], mi.Float],
+    sampler: mi.Sampler,
+    count: int,
+    active: mi.Bool,
+) -> EdgeSample:
+    """Of a few samples keep one, in proportion to `target` over density (Talbot et al. 2005, "Importance Resampling for
+    Global Illumination"): the more there are, the closer the density comes to `target`.
+
+    draw : makes the k-th sample.
+    target : of the density with respect to t; 0 only where the integrand is.
+
+    Returns
+    -------
+    EdgeSample, (N,). Its `density` is what an unbiased estimate divides by, though no density.
+    """
+
+    def step(k, kept, t, value, total, sampler):
+        e = draw(k, sampler)
+        new = target(e)
+        weight = dr.select(e.density > 0, new / e.density, 0)
+        weight = dr.select(active & dr.isfinite(weight), weight, 0)
+        total += weight
+        taken = sampler.next_1d(active) * total < weight
+        choose = lambda a, b: dr.select(taken, a, b)
+        return k + 1, choose(e.edge, kept), choose(e.t, t), choose(new, value), total, sampler
+
+    width = dr.width(active)
+    zero = dr.zeros(mi.Float, width)
+    _, edge, t, value, total, _ = dr.while_loop(
+        (mi.Float(zero), dr.zeros(mi.UInt32, width), mi.Float(zero), mi.Float(zero), mi.Float(zero), sampler),
+        lambda k, *_: active & (k < count),
+        step,
+        label="candidates",
+    )
+    return EdgeSample(edge, t, dr.select(total > 0, value * count / total, 0))
 
 
 def _renewed(choice: mi.Float, density: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:

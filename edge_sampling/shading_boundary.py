@@ -27,15 +27,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .edge_importance import EdgeSample, Lobe, View, sample_edge
+from .edge_importance import EdgeSample, Lobe, View, resample, sample_edge
 from .edge_tree import EdgeTree
 from .edges import Edges
 from .emitter_boxes import EmitterBoxes
 from .meshes import Geometry
 from .projection import Projection, inside_frame, tangent
 
-#: Directions sampled from a BSDF, to find its peak.
-CANDIDATES = 8
+#: Directions that are sampled from a BSDF, to find its peak.
+DIRECTIONS = 8
+
+#: Edges from which one is kept, in proportion to what it contributes if nothing hides it.
+CANDIDATES = 4
 
 #: Scattered radiance of a point that a ray meets: called with the ray, what it meets, a sampler, a mask.
 Scattered = Callable[[Any, Any, Any, Any], Any]
@@ -163,7 +166,19 @@ class ShadingBoundary:
                 cone,
             )
             use = [1, dr.select(moves, 1, 0)] if len(self.groups) == 2 else [1]
-            e = sample_edge(self.tree, view, sampler, use, choice=choice, from_light=False, active=active)
+            positions = dr.detach(self.geometry.positions())
+
+            def draw(k, sampler):
+                part = (choice + k) / CANDIDATES
+                return sample_edge(self.tree, view, sampler, use, choice=part, from_light=False, active=active)
+
+            def unshadowed(e):
+                a, b = self.tree.device_edges.end_points(positions, e.edge)
+                d = dr.lerp(a, b, e.t) - si.p
+                f = bsdf.eval(mi.BSDFContext(), si, si.to_local(dr.normalize(d)), active)
+                return dr.max(f) * dr.norm(dr.cross(d, b - a)) * dr.rcp(dr.squared_norm(d))
+
+            e = resample(draw, unshadowed, sampler, CANDIDATES, active)
             e.density *= dr.select(emission, p / light_weight, 1 - p)
         share = (lambda a, b: dr.select(share_emission, _share(b, a), 1)) if self.from_lights_possible else None
         return self._evaluate(scene, si, e, sampler, active, light, share, emission=emission, scattered=scattered)
@@ -186,7 +201,7 @@ class ShadingBoundary:
         axis = dr.zeros(mi.Vector3f, width)
         axis.z = 1
         state = (dr.zeros(mi.UInt32, width), axis, dr.zeros(mi.Float, width), sampler)
-        _, axis, pdf, _ = dr.while_loop(state, lambda k, *_: active & (k < CANDIDATES), draw, label="peak of a BSDF")
+        _, axis, pdf, _ = dr.while_loop(state, lambda k, *_: active & (k < DIRECTIONS), draw, label="peak of a BSDF")
         # As wide as a lobe of that density.
         return Lobe(si.to_world(axis), pdf, dr.clip(dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-3)), 1e-5, 1))
 

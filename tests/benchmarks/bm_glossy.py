@@ -41,7 +41,7 @@ from _bench import (
 )
 
 from rimlight.edge_sampling import Geometry, find_edges
-from rimlight.edge_sampling.edge_importance import View, sample_edge
+from rimlight.edge_sampling.edge_importance import Lobe, View, sample_edge
 from rimlight.edge_sampling.edge_tree import EdgeTree
 
 OURS, PEER = "direct_edge", "direct_projective"
@@ -126,7 +126,7 @@ def edges_chosen(how: str) -> Iterator[None]:
             for replacement in normal_cones.replacements():
                 patch(*replacement)
         if how in ("uniformly", "without lobes"):
-            patch(boundary, "_lobes", lambda *_: [])
+            patch(boundary, "_lobe", lambda *_: Lobe(mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(1)))
         yield
 
 
