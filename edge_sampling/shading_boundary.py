@@ -37,6 +37,9 @@ from .projection import Projection, inside_frame, tangent
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
 
+#: Part of the samples that are for emitted light, where scattered light counts, too.
+EMISSION = 2 / 3
+
 #: Edges from which one is kept, in proportion to what it contributes if nothing hides it.
 CANDIDATES = 4
 
@@ -148,7 +151,7 @@ class ShadingBoundary:
             emission, scattering = mi.Bool(emission), mi.Bool(scattering) & (scattered is not None)
             active &= emission | scattering
             # Emitted light is sought in the directions of one light, scattered light everywhere.
-            p = dr.select(emission, dr.select(scattering, 0.5, 1), 0)
+            p = dr.select(emission, dr.select(scattering, EMISSION, 1), 0)
             emission = sampler.next_1d(active) < p
             light, light_weight, _ = scene.sample_emitter(sampler.next_1d(active), active)
             cone = self.boxes.cone(light, si.p)
