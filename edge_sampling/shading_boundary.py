@@ -216,10 +216,12 @@ class ShadingBoundary:
         sensor: mi.Sensor,
         sampler: mi.Sampler,
         first_hit: Callable[[mi.Scene, mi.Ray3f, mi.Bool], mi.PreliminaryIntersection3f],
+        attach: Callable[[mi.RayDifferential3f], mi.RayDifferential3f] = lambda ray: ray,
     ) -> LightSamples:
         """Sample points on lights, edges as seen from them, and the points on which their shadows fall.
 
         first_hit : what a camera ray meets.
+        attach : applied to the camera rays.
         """
         count = sampler.wavefront_size()
         with dr.resume_grad():
@@ -285,6 +287,7 @@ class ShadingBoundary:
                     mi.Point2f(0.5) if aperture_sample is None else aperture_sample,
                     active,
                 )
+            ray = attach(ray)
             seen = first_hit(scene, ray, active)
             active &= seen.is_valid() & (seen.shape == pi.shape)
             with dr.resume_grad():
@@ -383,8 +386,6 @@ class ShadingBoundary:
                 L += dr.select(reflected, scattered(ray, pi, sampler, reflected), 0)
             L = dr.select(active, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)
-            if self.everything:
-                dr.eval(L, n_dl)  # as in `FilmBoundary.sample`
 
         with dr.resume_grad():
             a, b = edges.end_points(positions, sample.edge)

@@ -45,6 +45,34 @@ class Sample:
     alpha: mi.Float
 
 
+class CutRays:
+    """Camera rays that carry gradients of their own, to be passed on to the sensor once they are known.
+
+    A sensor's parameters are a few numbers. The gradient of each is a sum over all samples, in a kernel of its own, and
+    without the cut each of these kernels would trace all rays again.
+    """
+
+    def __init__(self) -> None:
+        self._cuts: list[tuple] = []
+
+    def __call__(self, ray: mi.RayDifferential3f) -> mi.RayDifferential3f:
+        with dr.resume_grad():
+            if not dr.grad_enabled(ray.o, ray.d):
+                return ray
+            cut = dr.detach(ray)
+            dr.enable_grad(cut.o, cut.d)
+        self._cuts += [(ray.o, cut.o), (ray.d, cut.d)]
+        return cut
+
+    def backward(self) -> None:
+        gradients = [dr.grad(cut) for _, cut in self._cuts]
+        dr.eval(gradients)
+        for (ray, _), gradient in zip(self._cuts, gradients, strict=True):
+            dr.set_grad(ray, gradient)
+            dr.enqueue(dr.ADMode.Backward, ray)
+        dr.traverse(dr.ADMode.Backward)
+
+
 @dataclass(frozen=True)
 class Term:
     """The film samples of one term of the derivative.
@@ -54,6 +82,7 @@ class Term:
     per_pixel : how many neighbours in the wavefront belong to one pixel, 0 if they are in no order.
     replay : None, or what differentiates the part of the path that `value` is not attached to.
     throughput : of the camera ray, which weighs that part.
+    rays : None, or the cut between `value` and the sensor.
     """
 
     position: mi.Point2f
@@ -63,6 +92,7 @@ class Term:
     per_pixel: int
     replay: Replay | None = None
     throughput: mi.Spectrum | None = None
+    rays: CutRays | None = None
 
     def detached(self) -> Term:
         return replace(self, value=dr.detach(self.value))
@@ -159,6 +189,9 @@ class EdgeIntegrator(ADIntegrator):
                     dr.set_grad(term.value, gradient)
                     dr.enqueue(dr.ADMode.Backward, term.value)
                 dr.traverse(dr.ADMode.Backward)
+                for term in terms:
+                    if term.rays is not None:
+                        term.rays.backward()
             dr.eval()
 
     # ---------------------- Radiance ----------------------
@@ -286,19 +319,20 @@ class EdgeIntegrator(ADIntegrator):
         if shading is not None and sppi > 0:
             shading.refit()
             if shading.from_lights_possible:
-                terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, shading))
+                terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, mode, shading))
             if self._looks_from_points(shading):
-                terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, shading))
+                terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, mode, shading))
         return sensor.film(), terms
 
     def _interior(self, scene, sensor, sampler, weights, mode, wanted: bool) -> Term:
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
         if not wanted:
             return Term(position, Sample(mi.Spectrum(0), mi.Float(0)), ray.wavelengths, 1.0, weights)
-        L, _, _, replay = self.sample(mode, scene, sampler, ray)
+        rays = CutRays() if mode == dr.ADMode.Backward else None
+        L, _, _, replay = self.sample(mode, scene, sampler, rays(ray) if rays else ray)
         with dr.resume_grad():
             value = Sample(L * ray_weight, mi.Float(0))
-        return Term(position, value, ray.wavelengths, 1.0, weights, replay, dr.detach(ray_weight))
+        return Term(position, value, ray.wavelengths, 1.0, weights, replay, dr.detach(ray_weight), rays)
 
     def _film_boundary(self, scene, sensor, seed, sppp, weights, boundary: FilmBoundary) -> Term:
         """Visibility as seen from the sensor."""
@@ -311,22 +345,25 @@ class EdgeIntegrator(ADIntegrator):
         with dr.resume_grad():
             return Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0)
 
-    def _shadows(self, scene, sensor, seed, sppi, weights, shading: ShadingBoundary) -> Term:
+    def _shadows(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
         """Shadows at the first vertex, found from the lights."""
         sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
-        s = shading.from_lights(scene, sensor, sampler, self._first_hit)
+        rays = CutRays() if mode == dr.ADMode.Backward else None
+        s = shading.from_lights(scene, sensor, sampler, self._first_hit, rays or (lambda ray: ray))
         with dr.resume_grad():
-            return Term(s.position, Sample(s.value * weights, mi.Float(0)), s.wavelengths, 0.0, 0)
+            return Term(s.position, Sample(s.value * weights, mi.Float(0)), s.wavelengths, 0.0, 0, rays=rays)
 
-    def _from_points(self, scene, sensor, seed, sppi, weights, shading: ShadingBoundary) -> Term:
+    def _from_points(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
         """Boundaries as seen from one vertex of each path."""
         seed = 0x55555555 ^ seed
         sampler, sppi = self._sampler(sensor, seed, sppi)
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
         choice = stratified(sampler, seed)
-        L = self._seen_from_vertex(scene, sampler, choice, ray, shading)
+        rays = CutRays() if mode == dr.ADMode.Backward else None
+        L = self._seen_from_vertex(scene, sampler, choice, rays(ray) if rays else ray, shading)
         with dr.resume_grad():
-            return Term(position, Sample(L * ray_weight * (weights / sppi), mi.Float(0)), ray.wavelengths, 0.0, sppi)
+            value = Sample(L * ray_weight * (weights / sppi), mi.Float(0))
+            return Term(position, value, ray.wavelengths, 0.0, sppi, rays=rays)
 
     @staticmethod
     def _develop(film: mi.Film, terms: list[Term], values: list[Sample]) -> mi.TensorXf:
