@@ -166,7 +166,8 @@ class EdgeIntegrator(ADIntegrator):
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the
         image, makes of them."""
-        with dr.suspend_grad():
+        # Isolated, so that what lies behind the parameters is traversed once, and last: the sensor's share comes late.
+        with dr.isolate_grad(), dr.suspend_grad():
             film, makers = self._terms(scene, sensor, seed, spp, dr.ADMode.Backward)
             terms = [make() for make in makers]
             with dr.resume_grad():
