@@ -11,10 +11,11 @@ point* that is seen there. A face that ends at the edge moves as the edge does, 
 creases, nor the outlines of lights by their own motion. What is left is what is seen past a silhouette, on the side
 where its faces are not.
 
-Edges are found in two ways. *From points*: at a shading point of a path, by a descent of the edge tree. *From lights*:
-from a point on a light, by the same descent; the shading point is then where the shadow of the edge falls, if the
-sensor sees it. Only the second finds the shadows that small lights cast. Emitted light that both find is divided as
-between the sampling of lights and of the BSDF in path tracing.
+Edges are found in two ways. *From points*: at a shading point of a path, by a descent of the edge tree, for emitted
+light within the cone of directions to one light; of a few edges one is kept. *From lights*: from a point on a light, by
+the same descent; the shading point is then where the shadow of the edge falls, if the sensor sees it. Only the second
+finds the shadows that small lights cast. Emitted light that both find is divided as between the sampling of lights and
+of the BSDF in path tracing.
 """
 
 from __future__ import annotations

@@ -253,10 +253,11 @@ def _redner_text(scenes: list[dict[str, Any]]) -> list[str]:
     )
     return [
         "**redner**, the code of Li et al. 2018: derivative of the sum of all pixels as a shape moves along x, 4 "
-        "samples per pixel, its tests' start poses. Times are CPU seconds of the backward pass, on one core. "
-        "redner's numbers are constants, measured once on another machine: their ratio to ours is rough. The truths are finite differences. For the shadow of the blocker two are given, with an error "
-        "against each: that which redner was measured against, 756 ± 11 at 256 × 256 pixels, and one of our own with "
-        "more samples, 801 ± 13. *Frozen* is the same derivative in a function that `dr.freeze` has recorded. "
+        "samples per pixel, its tests' start poses. Times are CPU seconds of the backward pass, on one core. redner's "
+        "numbers are constants, measured once on another machine: their ratio to ours is rough. The truths are finite "
+        "differences. For the shadow of the blocker two are given, with an error against each: that which redner was "
+        "measured against, 756 ± 11 at 256 × 256 pixels, and one of our own with more samples, 801 ± 13. *Frozen* is "
+        "the same derivative in a function that `dr.freeze` has recorded. "
         "Efficiency ratio: (MSE · CPU s) of redner / ours.",
         *table(
             {
