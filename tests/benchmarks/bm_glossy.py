@@ -41,7 +41,7 @@ from _bench import (
 )
 
 from rimlight.edge_sampling import Geometry, find_edges
-from rimlight.edge_sampling.edge_importance import Lobe, View, sample_edge
+from rimlight.edge_sampling.edge_importance import EdgeSample, Lobe, View, resample, sample_edge
 from rimlight.edge_sampling.edge_tree import EdgeTree
 
 OURS, PEER = "direct_edge", "direct_projective"
@@ -168,31 +168,42 @@ def single_choices(settings: Settings, _: Path) -> dict[str, Any]:
     p = geometry.host_positions()
     middle = p.mean(0)
     radius, found = np.linalg.norm(p - middle, axis=1).max(), []
-    for how in ("uniformly", "by normal cones", "by importance"):
+    for how, candidates in (("uniformly", 1), ("by normal cones", 1), ("by importance", 1), ("by importance", 4)):
         with edges_chosen(how):
             tree = EdgeTree(geometry, edges, [np.arange(len(edges))])
             tree.refit(positions)
-            row, random = {"how": how}, np.random.default_rng(0)
+            row, random = {"how": how, "candidates": candidates}, np.random.default_rng(0)
             for name, distance in DISTANCES.items():
                 d = random.normal(size=(3 if settings.quick else POINTS, 3))
                 eyes = middle + distance * radius * d / np.linalg.norm(d, axis=1, keepdims=True)
-                weights = np.array([_weights(tree, positions, eye, seed) for seed, eye in enumerate(eyes)])
+                weights = np.array([_weights(tree, positions, eye, candidates, seed) for seed, eye in enumerate(eyes)])
                 row[name] = float(((weights**2).mean(1) / weights.mean(1) ** 2).mean())
                 row[f"{name}_hits"] = float((weights > 0).mean())
             found.append(row)
     return {"edges": len(edges), "points": len(d), "choices": found}
 
 
-def _weights(tree: EdgeTree, positions: mi.Float, eye: np.ndarray, seed: int, count: int = 200_000) -> np.ndarray:
-    """Of edges as seen from a point; 0 where they are no boundaries."""
+def _weights(
+    tree: EdgeTree, positions: mi.Float, eye: np.ndarray, candidates: int, seed: int, count: int = 200_000
+) -> np.ndarray:
+    """Of edges as seen from a point; 0 where they are no boundaries. Of several candidates, one is kept."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, count)
     eye = mi.Point3f(*(dr.opaque(mi.Float, float(x), count) for x in eye))
     view = View(mi.Vector3f(eye - tree.centre), mi.Vector3f(0), dr.full(mi.Float, 1, count), [])
-    e = sample_edge(tree, view, sampler, [1], from_light=False, active=mi.Bool(True))
-    a, b = tree.device_edges.end_points(positions, e.edge)
+    choice, active = sampler.next_1d(), dr.full(mi.Bool, True, count)
+
+    def draw(k: mi.Float | int, sampler: mi.Sampler) -> EdgeSample:
+        part = (choice + k) / candidates
+        return sample_edge(tree, view, sampler, [1], choice=part, from_light=False, active=active)
+
+    def length_by_distance(e: EdgeSample) -> mi.Float:
+        a, b = tree.device_edges.end_points(positions, e.edge)
+        return dr.norm(b - a) / dr.norm(dr.lerp(a, b, e.t) - eye)
+
+    e = draw(0, sampler) if candidates == 1 else resample(draw, length_by_distance, sampler, candidates, active)
     hit = (e.density > 0) & tree.device_edges.is_boundary(positions, e.edge, eye)
-    return np.array(dr.select(hit, dr.norm(b - a) / dr.norm(dr.lerp(a, b, e.t) - eye) / e.density, 0), float)
+    return np.array(dr.select(hit, length_by_distance(e) / e.density, 0), float)
 
 
 # ---------------------- Report ----------------------
@@ -209,7 +220,8 @@ def report(found: dict[str, Any]) -> list[str]:
             "pixels, the same time for each way to choose an edge. The truth is a mean of many renders with importance "
             f"sampling; its own noise is {percent(case['truth_error'])}. *By normal cones*: a node, or an edge in a "
             "leaf, counts with its whole length, unless a cone around its face normals shows that it has no "
-            "silhouettes. The weights of directions are the same.",
+            "silhouettes. The weights of directions are the same. In all of them, one of four edges is kept, in "
+            "proportion to what it contributes if nothing hides it.",
             *table(
                 {
                     "<edges chosen": lambda c: c["how"],
@@ -232,6 +244,7 @@ def report(found: dict[str, Any]) -> list[str]:
             *table(
                 {
                     "<edges chosen": lambda c: c["how"],
+                    "candidates": lambda c: c["candidates"],
                     "boundaries, far": lambda c: percent(c["far_hits"]),
                     "near": lambda c: percent(c["near_hits"]),
                     "second moment, far": lambda c: f"{c['far']:.2f}",
