@@ -117,6 +117,7 @@ class ShadingBoundary:
     def from_points(
         self,
         scene: mi.Scene,
+        positions: mi.Float,
         si: mi.SurfaceInteraction3f,
         sampler: mi.Sampler,
         choice: mi.Float,
@@ -130,6 +131,8 @@ class ShadingBoundary:
         """One sample of the boundary integral at each of `si`: of the light that a light emits, or of light that is
         scattered.
 
+        positions : of the vertices, from `Geometry.positions`; attached. Made before `si`: in backward mode, their
+            gradients are then complete before they are passed on, which takes one kernel, and not two.
         si : attached to whatever moves it.
         choice : see `sample_edge`.
         share_emission : where lights of finite size are sampled from the lights, too.
@@ -170,7 +173,6 @@ class ShadingBoundary:
                 cone,
             )
             use = [1, dr.select(moves, 1, 0)] if len(self.groups) == 2 else [1]
-            positions = dr.detach(self.geometry.positions())
 
             def draw(k, sampler):
                 part = (choice + k) / CANDIDATES
@@ -185,7 +187,9 @@ class ShadingBoundary:
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
             e.density *= dr.select(emission, p / light_weight, 1 - p)
         share = (lambda a, b: dr.select(share_emission, _share(b, a), 1)) if self.from_lights_possible else None
-        return self._evaluate(scene, si, e, sampler, active, light, share, emission=emission, scattered=scattered)
+        return self._evaluate(
+            scene, positions, si, e, sampler, active, light, share, emission=emission, scattered=scattered
+        )
 
     @staticmethod
     def _lobe(si, bsdf, sampler, active) -> Lobe:
@@ -227,6 +231,7 @@ class ShadingBoundary:
         count = sampler.wavefront_size()
         with dr.resume_grad():
             projection = Projection(sensor)
+            positions = self.geometry.positions()
         with dr.suspend_grad():
             # ---------------------- A point on a light ----------------------
 
@@ -246,7 +251,6 @@ class ShadingBoundary:
             choice = dr.minimum(choice, dr.one_minus_epsilon(mi.Float))
             e = sample_edge(self.tree, view, sampler, use, choice=choice, from_light=True, active=active)
             active &= e.density > 0
-            positions = dr.detach(self.geometry.positions())
             a, b = self.tree.device_edges.end_points(positions, e.edge)
             p = dr.lerp(a, b, e.t)
             ω = dr.normalize(p - y.p)
@@ -309,7 +313,7 @@ class ShadingBoundary:
             active &= dr.isfinite(e.density) & (e.density > 0)
 
         share = _share if self.emission_from_points else None
-        value = self._evaluate(scene, si, e, sampler, active, emitter, share, target=y)
+        value = self._evaluate(scene, positions, si, e, sampler, active, emitter, share, target=y)
         with dr.resume_grad():
             return LightSamples(u, value * ray_weight, ray.wavelengths)
 
@@ -318,6 +322,7 @@ class ShadingBoundary:
     def _evaluate(
         self,
         scene: mi.Scene,
+        positions: mi.Float,
         si: mi.SurfaceInteraction3f,
         sample: EdgeSample,
         sampler: mi.Sampler,
@@ -337,8 +342,6 @@ class ShadingBoundary:
         target : only this point of the light counts.
         """
         edges = self.tree.device_edges
-        with dr.resume_grad():
-            positions = self.geometry.positions()
         with dr.suspend_grad():
             a, b = edges.end_points(positions, sample.edge)
             p = dr.lerp(a, b, sample.t)

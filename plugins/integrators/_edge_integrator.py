@@ -277,6 +277,7 @@ class EdgeIntegrator(ADIntegrator):
             scattered = lambda ray, pi, sampler, active: self._onwards(scene, vertex, ray, pi, sampler, active)
         at_first = vertex.depth == 1
         with dr.resume_grad():
+            positions = shading.geometry.positions()
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, at_first)
             if self.depths.scatters(2):
                 # Vertices farther on follow their surfaces.
@@ -284,6 +285,7 @@ class EdgeIntegrator(ADIntegrator):
                 si = dr.select(at_first, si, vertex.pi.compute_surface_interaction(vertex.ray, follow, chosen))
         L = shading.from_points(
             scene,
+            positions,
             si,
             sampler,
             choice,
