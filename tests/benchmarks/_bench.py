@@ -505,7 +505,8 @@ def plot_errors(found: dict[str, dict[str, Any]], path: Path) -> None:
         noise = case["reference"]["noise"]
         axes.axhline(noise, color="0.6", linewidth=1, linestyle=":", label="noise of the reference")
         axes.set(title=name, xlabel="time of a derivative image (s)", ylabel="relative L1 error")
-        axes.legend(fontsize=7)
+    labelled = {label: line for axes in row for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    made.legend(labelled.values(), labelled, loc="outside lower center", ncols=len(labelled), fontsize=8)
     spp = sorted({r["spp"] for c in found.values() for r in c["rows"]})
     made.suptitle(f"32 × 32 pixels, {spp[0]} to {spp[-1]} samples per pixel; lower left is better", fontsize=9)
     save(made, path)
