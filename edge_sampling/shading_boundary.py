@@ -262,7 +262,8 @@ class ShadingBoundary:
             # ---------------------- Where its shadow falls ----------------------
 
             offset = _offset(p, y.p)
-            shadow = mi.Ray3f(mi.Point3f(p + outward * offset * across), ω, time, [])
+            shadow = mi.Ray3f(mi.Point3f(p + outward * offset * across), ω)
+            shadow.time = time
             pi = scene.ray_intersect_preliminary(shadow, active=active)
             active &= pi.is_valid()
             # A ray towards the light will start above the surface: from where it starts, it must meet the edge.

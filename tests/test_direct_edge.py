@@ -191,10 +191,10 @@ def test_without_interior_samples_the_filter_still_normalises():
     assert np.abs(whole - boundary).sum() < 0.03 * np.abs(whole).sum()
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
-def test_other_variants_agree_with_rgb(variant):
+@pytest.mark.parametrize("other_variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_other_variants_agree_with_rgb(other_variant):
     rgb = average_derivative()
-    mi.set_variant(variant)
+    mi.set_variant(other_variant)
     try:
         other = average_derivative()
     finally:

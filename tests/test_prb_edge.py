@@ -245,3 +245,31 @@ def test_mirrors_are_warned_about_once():
     finally:
         mi.logger().remove_appender(appender)
     assert sum("prb_edge: the derivative lacks" in m and "perfect mirrors" in m for m in messages) == 1
+
+
+# ---------------------- Other variants ----------------------
+
+
+@pytest.mark.parametrize("other_variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_other_variants_agree_with_rgb(other_variant):
+    """In a grey scene, and forward with backward in any."""
+    rgb, _, _ = grey_derivative()
+    mi.set_variant(other_variant)
+    try:
+        other, forward, backward = grey_derivative()
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+    assert np.abs(other - rgb).sum() < 0.05 * np.abs(rgb).sum()
+    assert backward == pytest.approx(forward, rel=1e-3)
+
+
+def grey_derivative() -> tuple[np.ndarray, float, float]:
+    """Of luminance, and its sum in forward and in backward mode in a room with a rough floor."""
+    film = cases.film(width=16, height=16, pixel_format="luminance")
+    scene = cases.shadow_blocker(lambda *view: cases.camera(*view, film=film))()
+    motion = Motion(scene, **cases.BLOCKER_UP)
+    mean = np.mean([jacobian_times(scene, motion, spp=64, seed=i) for i in range(8)], 0)
+    scene = room(rough=True)
+    motion = Motion(scene, **SIDE)
+    J = jacobian_times(scene, motion)
+    return mean, J.sum(), gradient(scene, motion, np.ones_like(J, np.float32))

@@ -334,7 +334,7 @@ class EdgeIntegrator(ADIntegrator):
         rays = CutRays() if mode == dr.ADMode.Backward else None
         L, _, _, replay = self.sample(mode, scene, sampler, rays(ray) if rays else ray)
         with dr.resume_grad():
-            value = Sample(L * ray_weight, mi.Float(0))
+            value = Sample(mi.Spectrum(L * ray_weight), mi.Float(0))
         return Term(position, value, ray.wavelengths, 1.0, weights, replay, dr.detach(ray_weight), rays)
 
     def _film_boundary(self, scene, sensor, seed, sppp, weights, boundary: FilmBoundary) -> Term:
@@ -346,7 +346,8 @@ class EdgeIntegrator(ADIntegrator):
         sampler.seed(0xFFFFFFFF ^ seed, count)
         s = boundary.sample(sensor, sampler, count, lambda *args: self._beside_edge(scene, *args))
         with dr.resume_grad():
-            return Term(s.position, Sample(s.value * weights, s.alpha * weights), s.wavelengths, 0.0, 0)
+            value = Sample(mi.Spectrum(s.value * weights), s.alpha * weights)
+            return Term(s.position, value, s.wavelengths, 0.0, 0)
 
     def _shadows(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
         """Shadows at the first vertex, found from the lights."""
@@ -354,7 +355,8 @@ class EdgeIntegrator(ADIntegrator):
         rays = CutRays() if mode == dr.ADMode.Backward else None
         s = shading.from_lights(scene, sensor, sampler, self._first_hit, rays or (lambda ray: ray))
         with dr.resume_grad():
-            return Term(s.position, Sample(s.value * weights, mi.Float(0)), s.wavelengths, 0.0, 0, rays=rays)
+            value = Sample(mi.Spectrum(s.value * weights), mi.Float(0))
+            return Term(s.position, value, s.wavelengths, 0.0, 0, rays=rays)
 
     def _from_points(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
         """Boundaries as seen from one vertex of each path."""
@@ -365,7 +367,7 @@ class EdgeIntegrator(ADIntegrator):
         rays = CutRays() if mode == dr.ADMode.Backward else None
         L = self._seen_from_vertex(scene, sampler, choice, rays(ray) if rays else ray, shading)
         with dr.resume_grad():
-            value = Sample(L * ray_weight * (weights / sppi), mi.Float(0))
+            value = Sample(mi.Spectrum(L * ray_weight * (weights / sppi)), mi.Float(0))
             return Term(position, value, ray.wavelengths, 0.0, sppi, rays=rays)
 
     @staticmethod

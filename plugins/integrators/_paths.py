@@ -126,7 +126,7 @@ class Replay:
                 rest = dr.select(dr.detach(weight) != 0, L * weight / dr.detach(weight), 0)
                 Lo = dr.select(active, vertex.β * direct + rest, 0)
                 if δL is None:
-                    tangent += dr.forward_to(Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+                    tangent += mi.Spectrum(dr.forward_to(Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
                 else:
                     dr.backward_from(δL * Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
             before = vertex
