@@ -95,7 +95,7 @@ def sample_edge(
     EdgeSample, (N,)
     """
     width = dr.width(view.p)
-    node, density = mi.UInt32(0), mi.Float(1)
+    density = mi.Float(1)
     bottom, node_offset, leaf_offset = mi.UInt32(1), mi.UInt32(0), mi.UInt32(0)
 
     # ---------------------- Which group ----------------------
@@ -220,7 +220,9 @@ def stratified(sampler: mi.Sampler, seed: mi.UInt32 | int) -> mi.Float:
     the van der Corput sequence, jittered, and shifted for each 64 by another random number, so that each number by
     itself is uniform."""
     i = dr.arange(mi.UInt32, sampler.wavefront_size())
-    shift = mi.sample_tea_float32(i >> 6, dr.opaque(mi.UInt32, seed) if isinstance(seed, int) else seed)
+    if not isinstance(seed, mi.UInt32):
+        seed = dr.opaque(mi.UInt32, int(seed))
+    shift = mi.sample_tea_float32(i >> 6, seed)
     x = (mi.Float(dr.brev(i << 26)) + sampler.next_1d()) / 64 + shift
     return dr.minimum(x - dr.floor(x), dr.one_minus_epsilon(mi.Float))
 

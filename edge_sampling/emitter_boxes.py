@@ -25,26 +25,40 @@ class EmitterBoxes:
     DRJIT_STRUCT = dict.fromkeys(("lower", "upper", "_lower", "_upper", "_vertex", "_emitter"))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, geometry: Geometry):
-        shapes = [e.get_shape() for e in scene.emitters()]
+        self._shapes = [e.get_shape() for e in scene.emitters()]
         offsets = np.cumsum([0, *(m.vertex_count() for m in geometry.meshes)])
         offset_of = {int(m.ptr): int(offset) for m, offset in zip(geometry.meshes, offsets, strict=False)}
-        lower, upper, vertex, emitter = [], [], [], []
-        for i, shape in enumerate(shapes):
-            box = (np.full(3, -np.inf), np.full(3, np.inf))
-            if shape is not None and int(shape.ptr) in offset_of:
-                box = box[::-1]
+        self._is_mesh = [s is not None and int(s.ptr) in offset_of for s in self._shapes]
+        vertex, emitter = [], []
+        for i, shape in enumerate(self._shapes):
+            if self._is_mesh[i]:
                 vertex.append(np.arange(shape.vertex_count()) + offset_of[int(shape.ptr)])
                 emitter.append(np.full(shape.vertex_count(), i))
+        self._vertex, self._emitter = (
+            mi.UInt32(np.concatenate(parts).astype(np.uint32)) if parts else None for parts in (vertex, emitter)
+        )
+        self._found: np.ndarray | None = None
+        self.find_shapes()
+
+    def find_shapes(self) -> None:
+        """Find where the lights that are no meshes are now. On the host, so not in frozen functions."""
+        lower, upper = [], []
+        for shape, is_mesh in zip(self._shapes, self._is_mesh, strict=True):
+            box = (np.full(3, -np.inf), np.full(3, np.inf))
+            if is_mesh:
+                box = box[::-1]
             elif shape is not None:
                 box = (np.array(shape.bbox().min), np.array(shape.bbox().max))
             lower.append(box[0])
             upper.append(box[1])
-        numbers = lambda rows: mi.Float(np.ravel(rows).astype(np.float32))
         # Where there is none, one that counts as everything: Dr.Jit 1.5 cannot freeze empty arrays.
-        self._lower, self._upper = numbers(lower or [[-np.inf] * 3]), numbers(upper or [[np.inf] * 3])
-        self._vertex, self._emitter = (
-            mi.UInt32(np.concatenate(parts).astype(np.uint32)) if parts else None for parts in (vertex, emitter)
-        )
+        found = np.array([np.ravel(lower or [-np.inf] * 3), np.ravel(upper or [np.inf] * 3)], np.float32)
+        if self._found is not None and (found == self._found).all():
+            return  # the same arrays: frozen functions need not be recorded again
+        self._found = found
+        # Not in NumPy's memory, for frozen functions.
+        self._lower, self._upper = (mi.Float(row) * dr.opaque(mi.Float, 1) for row in found)
+        dr.eval(self._lower, self._upper)
         self.lower, self.upper = self._lower, self._upper
 
     def refit(self, positions: mi.Float) -> None:

@@ -81,7 +81,7 @@ class FilmBoundary:
             rather than noise.
 
         Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by
-        it.
+        it, and folds of faces that are narrower on the film do not count.
         """
         with dr.resume_grad():
             projection = Projection(sensor)

@@ -77,7 +77,9 @@ class ShadingBoundary:
     """
 
     _NUMBERS = ("everything", "from_lights_possible", "transmits", "glossy", "emission_from_points")
-    DRJIT_STRUCT = dict.fromkeys(("tree", "boxes", "moving_shapes", "surface_lights", *_NUMBERS))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(
+        ("tree", "boxes", "moving_shapes", "surface_lights", "lights", *_NUMBERS)
+    )  # for `dr.freeze`
 
     def __init__(
         self,
@@ -98,6 +100,8 @@ class ShadingBoundary:
         emitters = scene.emitters()
         surface = [i for i, e in enumerate(emitters) if e.flags() & mi.EmitterFlags.Surface]
         self.surface_lights = mi.UInt32(surface or [0])  # Dr.Jit 1.5 cannot freeze empty arrays
+        #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
+        self.lights = mi.UInt32([i for i, e in enumerate(emitters) if not e.flags() & mi.EmitterFlags.Delta] or [0])
         self.from_lights_possible = bool(surface)
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
@@ -157,7 +161,7 @@ class ShadingBoundary:
             # Emitted light is sought in the directions of one light, scattered light everywhere.
             p = dr.select(emission, dr.select(scattering, EMISSION, 1), 0)
             emission = sampler.next_1d(active) < p
-            light, light_weight, _ = scene.sample_emitter(sampler.next_1d(active), active)
+            light, lights = self._choose(self.lights, sampler, active)
             cone = self.boxes.cone(light, si.p)
             cone.cos = dr.select(emission, cone.cos, -1)
             light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), light, active)
@@ -185,7 +189,7 @@ class ShadingBoundary:
                 return dr.max(f) * dr.norm(dr.cross(d, b - a)) * dr.rcp(dr.squared_norm(d))
 
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
-            e.density *= dr.select(emission, p / light_weight, 1 - p)
+            e.density *= dr.select(emission, p / lights, 1 - p)
         share = (lambda a, b: dr.select(share_emission, _share(b, a), 1)) if self.from_lights_possible else None
         return self._evaluate(
             scene, positions, si, e, sampler, active, light, share, emission=emission, scattered=scattered
@@ -235,9 +239,8 @@ class ShadingBoundary:
         with dr.suspend_grad():
             # ---------------------- A point on a light ----------------------
 
-            lights = dr.width(self.surface_lights)
-            which = dr.minimum(mi.UInt32(sampler.next_1d() * lights), lights - 1) if lights > 1 else mi.UInt32(0)
-            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.surface_lights, which))
+            light, lights = self._choose(self.surface_lights, sampler, True)
+            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), light)
             time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
             y, _ = emitter.sample_position(time, sampler.next_2d())
             active = (y.pdf > 0) & dr.isfinite(y.pdf)
@@ -319,6 +322,13 @@ class ShadingBoundary:
             return LightSamples(u, value * ray_weight, ray.wavelengths)
 
     # ---------------------- Both ----------------------
+
+    @staticmethod
+    def _choose(lights: mi.UInt32, sampler: mi.Sampler, active: mi.Bool | bool) -> tuple[mi.UInt32, int]:
+        """One of the lights, and how many there are."""
+        count = dr.width(lights)
+        which = dr.minimum(mi.UInt32(sampler.next_1d(active) * count), count - 1) if count > 1 else mi.UInt32(0)
+        return dr.gather(mi.UInt32, lights, which), count
 
     def _evaluate(
         self,

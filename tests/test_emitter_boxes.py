@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight.edge_sampling import Geometry
+from rimlight.edge_sampling import Geometry, Motion, derivative_image
 from rimlight.edge_sampling.emitter_boxes import EmitterBoxes
 
 LIGHTS = {
@@ -67,3 +67,40 @@ def test_cones_follow_the_vertices():
     found, sin = inside(scene, [0, 0, 0])
     assert found.all()
     assert sin < 0.3
+
+
+def test_cones_follow_a_sphere_between_derivatives():
+    """It is no mesh: its box is found anew before each derivative, though the edges are not."""
+    scene = cases.scene(
+        sensor=cases.camera(), thing=cases.horizontal((0, 1, 0), 0.5, "thing"), light=LIGHTS["sphere"]()
+    )
+    integrator = mi.load_dict({"type": "prb_edge", "max_depth": 3})
+    params = mi.traverse(scene)
+    dr.enable_grad(params["thing.vertex_positions"])
+    for centre in ([0.3, 2, 0.1], [4, 3, 2]):
+        params["light.to_world"] = mi.Transform4f().translate(centre).scale(0.5)
+        params.update()
+        boxes = integrator.find_boundaries(scene).shading.boxes
+        assert np.array(boxes.lower) == pytest.approx(np.array(centre) - 0.5, abs=1e-5)
+        assert np.array(boxes.upper) == pytest.approx(np.array(centre) + 0.5, abs=1e-5)
+
+
+def test_lights_that_mitsuba_does_not_sample_count():
+    """A light of sampling weight 0 is met by rays, and what occludes it has a derivative, seen in a mirror."""
+
+    def derivative(weight: float) -> np.ndarray:
+        emitter = {**cases.light(1, 1, 1), "sampling_weight": weight}
+        scene = cases.scene(
+            sensor=cases.camera((0, 2, -4), (0, -2, 0), film=cases.film(width=8, height=8)),
+            floor=cases.horizontal((0, 0, 0), 4, "floor", bsdf=cases.conductor(0.1)),
+            blocker=cases.quad([-0.5, 1, 1], [0, 1.5, 0], [1, 0, 0], "blocker", bsdf=cases.diffuse(0.0)),
+            light=cases.quad([-2, 0, 4], [0, 12, 0], [4, 0, 0], "light", bsdf=cases.diffuse(0.0), emitter=emitter),
+            other={"type": "point", "position": [0, 9, 0], "intensity": {"type": "rgb", "value": 1e-6}},
+        )
+        motion = Motion(scene, "blocker.vertex_positions", direction=[0, 1, 0])
+        integrator = mi.load_dict({"type": "direct_edge", "sppc": 0, "sppp": 0})
+        return np.mean([np.array(derivative_image(scene, integrator, motion, spp=256, seed=i)) for i in range(8)], 0)
+
+    sampled, unsampled = derivative(1), derivative(0)
+    assert np.abs(sampled).sum() > 0.1
+    assert np.abs(unsampled - sampled).sum() < 0.1 * np.abs(sampled).sum()

@@ -22,6 +22,7 @@ from rimlight.edge_sampling import (
     stratified,
 )
 
+from ._cut_rays import CutRays
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, up_to_horizon
 
@@ -43,34 +44,6 @@ class Sample:
 
     L: mi.Spectrum
     alpha: mi.Float
-
-
-class CutRays:
-    """Camera rays that carry gradients of their own, to be passed on to the sensor once they are known.
-
-    A sensor's parameters are a few numbers. The gradient of each is a sum over all samples, in a kernel of its own, and
-    without the cut each of these kernels would trace all rays again.
-    """
-
-    def __init__(self) -> None:
-        self._cuts: list[tuple] = []
-
-    def __call__(self, ray: mi.RayDifferential3f) -> mi.RayDifferential3f:
-        with dr.resume_grad():
-            if not dr.grad_enabled(ray.o, ray.d):
-                return ray
-            cut = dr.detach(ray)
-            dr.enable_grad(cut.o, cut.d)
-        self._cuts += [(ray.o, cut.o), (ray.d, cut.d)]
-        return cut
-
-    def backward(self) -> None:
-        gradients = [dr.grad(cut) for _, cut in self._cuts]
-        dr.eval(gradients)
-        for (ray, _), gradient in zip(self._cuts, gradients, strict=True):
-            dr.set_grad(ray, gradient)
-            dr.enqueue(dr.ADMode.Backward, ray)
-        dr.traverse(dr.ADMode.Backward)
 
 
 @dataclass(frozen=True)
@@ -331,8 +304,8 @@ class EdgeIntegrator(ADIntegrator):
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
         if not wanted:
             return Term(position, Sample(mi.Spectrum(0), mi.Float(0)), ray.wavelengths, 1.0, weights)
-        rays = CutRays() if mode == dr.ADMode.Backward else None
-        L, _, _, replay = self.sample(mode, scene, sampler, rays(ray) if rays else ray)
+        rays = CutRays(mode)
+        L, _, _, replay = self.sample(mode, scene, sampler, rays(ray))
         with dr.resume_grad():
             value = Sample(mi.Spectrum(L * ray_weight), mi.Float(0))
         return Term(position, value, ray.wavelengths, 1.0, weights, replay, dr.detach(ray_weight), rays)
@@ -352,8 +325,8 @@ class EdgeIntegrator(ADIntegrator):
     def _shadows(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
         """Shadows at the first vertex, found from the lights."""
         sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
-        rays = CutRays() if mode == dr.ADMode.Backward else None
-        s = shading.from_lights(scene, sensor, sampler, self._first_hit, rays or (lambda ray: ray))
+        rays = CutRays(mode)
+        s = shading.from_lights(scene, sensor, sampler, self._first_hit, rays)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(s.value * weights), mi.Float(0))
             return Term(s.position, value, s.wavelengths, 0.0, 0, rays=rays)
@@ -364,8 +337,8 @@ class EdgeIntegrator(ADIntegrator):
         sampler, sppi = self._sampler(sensor, seed, sppi)
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
         choice = stratified(sampler, seed)
-        rays = CutRays() if mode == dr.ADMode.Backward else None
-        L = self._seen_from_vertex(scene, sampler, choice, rays(ray) if rays else ray, shading)
+        rays = CutRays(mode)
+        L = self._seen_from_vertex(scene, sampler, choice, rays(ray), shading)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(L * ray_weight * (weights / sppi)), mi.Float(0))
             return Term(position, value, ray.wavelengths, 0.0, sppi, rays=rays)
@@ -502,6 +475,8 @@ class EdgeIntegrator(ADIntegrator):
                 camera_moves,
                 limits,
             )
+        if self._boundaries[key].shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
+            self._boundaries[key].shading.boxes.find_shapes()
         return self._boundaries[key]
 
     def _refuse_while_recording(self) -> None:
