@@ -17,7 +17,8 @@ from types import ModuleType
 
 import mitsuba as mi
 
-PACKAGES = ("rimlight.integrators",)  # their modules are plugin files, but for names with a leading underscore
+#: Their modules are plugin files, but for names with a leading underscore.
+PACKAGES = ("rimlight.bsdfs", "rimlight.emitters", "rimlight.integrators", "rimlight.sensors")
 
 _modules: dict[str, dict[str, ModuleType]] = {}  # variant -> full name -> module
 
