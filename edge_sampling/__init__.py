@@ -6,6 +6,7 @@ from .edges import EdgeKind, Edges, find_edges
 from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
 from .intersections import intersecting_meshes
+from .lights import Lights
 from .meshes import Geometry, jumping_textures
 from .motion import Motion, derivative_image
 from .projection import Projection
@@ -22,6 +23,7 @@ __all__ = [
     "FilmBoundary",
     "FiniteDifferences",
     "Geometry",
+    "Lights",
     "Lobe",
     "Motion",
     "Projection",

@@ -1,0 +1,54 @@
+"""The lights of a scene, one by one."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+class Lights:
+    """The lights of a scene: every emitter, or where an emitter consists of several lights, each of these.
+
+    An emitter of several lights is written in Python, and has besides Mitsuba's interface:
+
+    * `light_count`, int: the number of its lights;
+    * `light_sample(which: mi.UInt32, sample: mi.Point2f) -> tuple[mi.Point2f, mi.Float]`: the random numbers with which
+      its `sample_direction` chooses the light `which`, and the point `sample` of this; and the probability with which
+      uniform random numbers choose that light. Detached.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    """
+
+    DRJIT_STRUCT = dict.fromkeys(("emitter", "part", "several"))  # for `dr.freeze`
+
+    def __init__(self, scene: mi.Scene):
+        emitters = scene.emitters()
+        parts = [(i, k) for i, e in enumerate(emitters) for k in range(getattr(e, "light_count", 1))]
+        #: Emitter of each light, and which of its lights it is.
+        self.emitter, self.part = (mi.UInt32([p[j] for p in parts]) for j in (0, 1))
+        #: Emitters that consist of several lights, by their number in the scene.
+        self.several = {i: e for i, e in enumerate(emitters) if hasattr(e, "light_count")}
+
+    def __len__(self) -> int:
+        return dr.width(self.emitter)
+
+    def sample_direction(
+        self, scene: mi.Scene, light: mi.UInt32, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """A direction towards a light, and the radiance that arrives from there divided by its density: Mitsuba's
+        `Emitter.sample_direction` for this light alone.
+
+        light : mi.UInt32, (N,), number of the light.
+        """
+        emitter = dr.gather(mi.UInt32, self.emitter, light, active)
+        probability = mi.Float(1)
+        for i, several in self.several.items():
+            with dr.suspend_grad():
+                mine = active & (emitter == i)
+                chosen, p = several.light_sample(dr.gather(mi.UInt32, self.part, light, mine), sample)
+                sample, probability = dr.select(mine, chosen, sample), dr.select(mine, p, probability)
+        ds, weight = dr.gather(mi.EmitterPtr, scene.emitters_dr(), emitter, active).sample_direction(it, sample, active)
+        ds.pdf /= probability
+        return ds, weight * probability
