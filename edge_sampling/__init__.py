@@ -11,6 +11,7 @@ from .meshes import Geometry, jumping_textures
 from .motion import Motion, derivative_image
 from .projection import Projection
 from .shading_boundary import ShadingBoundary
+from .shadow_boundary import ShadowBoundary, ShadowSamples
 from .zscores import mean_and_error, z_scores
 
 __all__ = [
@@ -28,6 +29,8 @@ __all__ = [
     "Motion",
     "Projection",
     "ShadingBoundary",
+    "ShadowBoundary",
+    "ShadowSamples",
     "View",
     "derivative_image",
     "find_edges",

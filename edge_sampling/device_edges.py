@@ -128,3 +128,9 @@ class DeviceEdges:
         if geometry is not None and EdgeKind.SPLIT in self._kinds:
             boundary |= (kind == int(EdgeKind.SPLIT)) & (self.normals_differ(geometry.normals(), edge) > COPLANAR)
         return boundary
+
+
+def beside_edge(p: mi.Point3f, q: mi.Point3f) -> mi.Float:
+    """How far beside an edge at p to look, from q or from p: just beyond what single precision can tell apart."""
+    scale = dr.max(dr.maximum(dr.abs(mi.Vector3f(p)), dr.abs(mi.Vector3f(q))))
+    return 32 * dr.epsilon(mi.Float) * scale + 1e-5 * dr.norm(p - q)

@@ -45,11 +45,12 @@ class Cone:
 class View:
     """From where the edges are looked at, and what is wanted of them: a sum of weights of directions.
 
-    p : mi.Vector3f, relative to the centre of the tree.
+    p : mi.Vector3f, relative to the centre of the tree; for a viewer at infinity, the direction towards it.
     n : mi.Vector3f, unit normal: directions below its plane are of no use. Zero where all are.
     wide : mi.Float, weight of all directions above the plane, by their cosine.
     lobes : around which there is more.
     cone : outside of which there is nothing; None: all directions count.
+    far : mi.Bool, is the viewer at infinity? None: nowhere. Not with lobes or cones.
     """
 
     p: mi.Vector3f
@@ -57,6 +58,12 @@ class View:
     wide: mi.Float
     lobes: list[Lobe]
     cone: Cone | None = None
+    far: mi.Bool | None = None
+
+    @property
+    def w(self) -> mi.Float | float:
+        """Homogeneous coordinate that goes with p: 1, or 0 at infinity. A point x is seen in the direction w x - p."""
+        return 1.0 if self.far is None else dr.select(self.far, mi.Float(0), 1)
 
 
 @dataclass
@@ -215,6 +222,12 @@ def _renewed(choice: mi.Float, density: mi.Float, sampler: mi.Sampler, active: m
     return dr.select(density < 2**-8, sampler.next_1d(active), choice)
 
 
+def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
+    """Weight of a strategy with density a against one with density b (Veach 1997, Eq. 9.13, with β = 2)."""
+    a2, b2 = dr.square(a), dr.square(b)
+    return dr.select(a2 > 0, a2 / (a2 + b2), 0)
+
+
 def stratified(sampler: mi.Sampler, seed: mi.UInt32 | int) -> mi.Float:
     """Uniform numbers, of which each 64 that follow one another are stratified, and each 2, 4, … of these as well:
     the van der Corput sequence, jittered, and shifted for each 64 by another random number, so that each number by
@@ -236,7 +249,7 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
     The number of sign changes of q·y among pairs of planes with mean μ, variance V, and a difference of second moment
     D is, for normally distributed planes, √(D/V) / π · exp(−μ² / 2V), where μ, V, D stand for μ·y, yᵀVy and yᵀDy.
     """
-    y = [*view.p, -1]
+    y = [*view.p, -view.w]
     lower, upper = mi.Float(0), mi.Float(0)
     for i in range(4):
         s, t = node.plane_lower[i] * y[i], node.plane_upper[i] * y[i]
@@ -254,8 +267,8 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
     length = node.always + node.silhouettes * (silhouettes + FLOOR)
 
     lower, upper = mi.Vector3f(node.lower), mi.Vector3f(node.upper)
-    half = 0.5 * (upper - lower)
-    d = 0.5 * (upper + lower) - view.p
+    half = 0.5 * view.w * (upper - lower)
+    d = 0.5 * view.w * (upper + lower) - view.p
     size2 = dr.squared_norm(half)
     r2 = dr.squared_norm(d) + size2
     above = dr.dot(view.n, d) + dr.dot(dr.abs(view.n), half)
@@ -286,9 +299,9 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
 
 def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     """What `importance` is for a node, for a single edge. Zero where that is no boundary."""
-    y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -1)
+    y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -view.w)
     signs = [dr.dot(q, y) for q in slot.planes]
-    edge_on = EDGE_ON * dr.norm(slot.a - view.p)
+    edge_on = EDGE_ON * dr.norm(view.w * slot.a - view.p)
     a, b, start, end = _in_cone(slot, view)
     length_a, length_b = dr.norm(a), dr.norm(b)
     boundary = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
@@ -307,6 +320,10 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
         result += _narrow(lobe, a, e / length, length, across / length).total
     if from_light:
         result *= dr.rsqrt(product)
+    if view.far is not None:
+        # Not the angle, but the extent across the direction of view.
+        across = dr.select(view.far, dr.norm(dr.cross(slot.b - slot.a, view.p)), across)
+        result = dr.select(view.far, view.wide * across, result)
     boundary &= (across > 0) & (start < end)
     return dr.select(boundary & dr.isfinite(result), result, 0)
 
@@ -330,7 +347,7 @@ def _along_and_off(axis: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Floa
 def _in_cone(slot: Slot, view: View) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Float]:
     """The part of an edge that is in the cone of the view: its ends, seen from the viewer, and its interval of t. Where
     there is none, the ends are equal."""
-    a, b = slot.a - view.p, slot.b - view.p
+    a, b = view.w * slot.a - view.p, view.w * slot.b - view.p
     if view.cone is None:
         return a, b, mi.Float(0), mi.Float(1)
     cone = view.cone
@@ -457,4 +474,5 @@ def _sample_point(slot: Slot, view: View, choice: mi.Float, u: mi.Float) -> tupl
         below = below + d.total  # not in place: it is the total of a density
     s = dr.clip(s, 0, length)
     pdf = sum(d.total * d.pdf(s) for d in densities) / total
-    return dr.lerp(start, end, s / length), pdf * length / (end - start)
+    t, pdf = dr.lerp(start, end, s / length), pdf * length / (end - start)
+    return (t, pdf) if view.far is None else (dr.select(view.far, u, t), dr.select(view.far, 1, pdf))

@@ -429,8 +429,50 @@ def open_air() -> mi.Scene:
     )
 
 
+def hard_shadow(lamp: Callable[[], dict], sensor: Callable[[], dict] = camera) -> Callable[[], mi.Scene]:
+    """A cube and its shadow on a floor, in the light of a lamp without size."""
+    return lambda: scene(
+        sensor=sensor(),
+        floor=horizontal((0, -1, 0), 3, "floor", bsdf=diffuse(0.6, 0.5, 0.4)),
+        cube=mesh("cube", 0.4 * cube_vertices() + [0.23, 0.1, 0], CUBE_FACES, bsdf=diffuse(0.4, 0.5, 0.7)),
+        lamp=lamp(),
+    )
+
+
+def spot() -> dict:
+    to_world = mi.ScalarTransform4f().look_at([-1, 4, -1], [0.2, 0, 0.1], [0, 0, 1])
+    return {"type": "spot", "to_world": to_world, "intensity": 20.0, "cutoff_angle": 25.0}
+
+
+def sun() -> dict:
+    return {"type": "directional", "direction": [0.5, -1, 0.3], "irradiance": 2.0}
+
+
+def lit_room() -> mi.Scene:
+    """A closed room with a point light and a cube."""
+    walls = {}
+    for k, name in enumerate(["left", "right", "floor", "ceiling", "back", "front"]):
+        axis, sign = k // 2, 1 - 2 * (k % 2)
+        o, u, v = np.zeros(3), np.zeros(3), np.zeros(3)
+        o[axis], u[(axis + 1) % 3], v[(axis + 2) % 3] = -sign, 2, 2
+        o[(axis + 1) % 3] = o[(axis + 2) % 3] = -1
+        u, v = (u, v) if sign > 0 else (v, u)
+        walls[name] = quad(
+            o * [1.5, 1, 2], u * [1.5, 1, 2], v * [1.5, 1, 2], name, bsdf=diffuse(0.6, 0.5 - 0.05 * k, 0.4)
+        )
+    return scene(
+        sensor=camera((0.4, 0.3, -1.8), (0, -0.2, 0.5), fov=60),
+        cube=mesh("cube", 0.2 * cube_vertices() + [0.2, -0.3, 0.7], CUBE_FACES, bsdf=diffuse(0.4, 0.5, 0.7)),
+        lamp={"type": "point", "position": [-0.4, 0.6, 0.2], "intensity": 2.0},
+        **walls,
+    )
+
+
 DEPTH = {"key": "cube.vertex_positions", "direction": [0, 0, 1]}
 SIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0]}
+TURN = {"key": "cube.vertex_positions", "rotate": [0.2, 1, 0]}
+LAMP_SIDE = {"key": "lamp.to_world", "direction": [1, 0.3, 0.2]}
+LAMP_TURN = {"key": "lamp.to_world", "rotate": [0.3, 0.2, 1]}
 CAMERA_X = {"key": "sensor.to_world", "direction": [1, 0, 0]}
 CAMERA_UP = {"key": "sensor.to_world", "direction": [0, 1, 0]}
 UP = {"key": "torus.vertex_positions", "direction": [0, 1, 0]}
@@ -495,7 +537,7 @@ CASES = [
     Case("two_triangles_green", two_triangles, vertex("green", 1), 4e-3, tolerance=0.01, spp=1024, runs=48),
     Case("two_triangles_red", two_triangles, vertex("red", 1), 4e-3, tolerance=0.01, spp=1024, runs=48),
     Case("cube_depth", cube(), DEPTH, 1e-2),
-    Case("cube_turn", cube(), {"key": "cube.vertex_positions", "rotate": [0.2, 1, 0]}, 6e-3, tolerance=0.03, spp=1024),
+    Case("cube_turn", cube(), TURN, 6e-3, tolerance=0.03, spp=1024),
     Case("cube_welded", cube(shape=welded_cube), DEPTH, 1e-2),
     Case("cube_split", cube(shape=split_cube), DEPTH, 1e-2),
     Case("coloured_cube_camera", coloured_cube, CAMERA_X, 6e-3),
@@ -583,6 +625,20 @@ CASES = [
         reference_spp=4096,
         needs=REDNER,
     ),
+    # Hard shadows.
+    Case("spot_cube", hard_shadow(spot), SIDE, 6e-3, 0.02, spp=1024),
+    Case("spot_cube_turn", hard_shadow(spot), TURN, 6e-3, 0.02, spp=1024),
+    Case("spot_light", hard_shadow(spot), LAMP_SIDE, 6e-3, 0.02, spp=1024),
+    Case("spot_light_turn", hard_shadow(spot), LAMP_TURN, 4e-3, 0.02, spp=1024),
+    Case("spot_camera", hard_shadow(spot), CAMERA_X, 6e-3, 0.02, spp=1024),
+    Case("sun_cube", hard_shadow(sun), SIDE, 6e-3, 0.02, spp=1024),
+    Case("sun_cube_turn", hard_shadow(sun), TURN, 6e-3, 0.02, spp=1024),
+    Case("sun_turns", hard_shadow(sun), LAMP_TURN, 4e-3, 0.02, spp=1024),
+    Case("sun_camera", hard_shadow(sun), CAMERA_X, 6e-3, 0.02, spp=1024),
+    Case("lit_room_cube", lit_room, SIDE, 3e-3, 0.02, spp=1024),
+    Case("lit_room_cube_turn", lit_room, TURN, 6e-3, 0.02, spp=1024),
+    Case("lit_room_light", lit_room, {"key": "lamp.position", "direction": [1, 0.3, 0.2]}, 3e-3, 0.02, spp=1024),
+    Case("lit_room_camera", lit_room, CAMERA_X, 3e-3, 0.02, spp=1024),
     # Geometry that moves at indirect bounces: only there, and in the frame as well.
     Case("out_of_frame", out_of_frame, SIDE, 0.12, 0.03, spp=1024, runs=100, integrator=prb_edge(3), noisy=True),
     Case("open_air", open_air, SIDE, 1e-2, 0.03, spp=1024, runs=96, integrator=prb_edge(3), noisy=True),

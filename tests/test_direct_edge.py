@@ -18,7 +18,7 @@ def forget_kernels(free_memory):
 
 
 def integrator(**options):
-    return mi.load_dict({"type": "direct_edge", **options})
+    return mi.load_dict({"type": "direct_edge"} | options)
 
 
 def jacobian_times(scene, motion, spp=16, seed=3, **options):
@@ -260,13 +260,6 @@ def test_meshes_in_a_shape_group_must_stand_still():
         moving(scene, "group.inner.vertex_positions", direction=[1, 0, 0])
 
 
-def test_a_point_light_that_moves_is_warned_about():
-    lamp = {"type": "point", "position": [0, 4, 0], "intensity": {"type": "rgb", "value": 5.0}}
-    scene = cases.cube(lamp=lambda: lamp)()
-    assert "hard shadows of point" in warnings_of(scene, "lamp.position", {}, direction=[1, 0, 0])
-    assert "hard shadows" not in warnings_of(scene, "lamp.position", {"sppi": 0}, direction=[1, 0, 0])
-
-
 def test_negative_sample_count_is_refused():
     with pytest.raises(RuntimeError, match='direct_edge: "sppi" must be a whole number >= 0, got -4'):
         integrator(sppi=-4)
@@ -300,7 +293,7 @@ def warnings_of(scene, key, options, **motion) -> str:
             derivative_image(scene, it, Motion(scene, key, **motion), spp=1)
     finally:
         logger.remove_appender(appender)
-    return "\n".join(m for m in messages if "direct_edge" in m)
+    return "\n".join(m for m in messages if "_edge: " in m)
 
 
 def test_limits_are_warned_about_once():
@@ -317,10 +310,13 @@ def test_limits_are_warned_about_once():
     }
     scene = cases.cube(lamp=lamp, mirror=mirror, board=board)()
     text = warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
-    for part in ("hard shadows of point", "perfect mirrors", "jumps of the textures"):
+    for part in ("perfect mirrors", "jumps of the textures"):
         assert text.count(part) == 1
+    assert "hard shadows" not in text
+    deep = {"type": "prb_edge", "max_depth": 3}
+    assert "lacks those in indirect light" in warnings_of(scene, "cube.vertex_positions", deep, direction=[1, 0, 0])
     quiet = warnings_of(scene, "cube.vertex_positions", {"sppi": 0}, direction=[1, 0, 0])
-    assert "hard shadows" not in quiet
+    assert "perfect mirrors" not in quiet
 
 
 def test_a_scene_that_does_not_move_is_a_mistake():

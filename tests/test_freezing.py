@@ -208,7 +208,9 @@ def test_all_that_is_read_is_known_to_frozen_functions():
     for part, unread in (
         (film, {"geometry"}),
         (film.edges, set()),
-        (shading, {"geometry", "groups"}),
+        (boundaries.shadows, set()),
+        (boundaries.shadows.lights, set()),
+        (shading, {"geometry"}),
         (shading.tree, {"geometry", "node_offsets", "leaf_offsets"}),
     ):
         assert vars(part).keys() - unread == type(part).DRJIT_STRUCT.keys(), type(part).__name__

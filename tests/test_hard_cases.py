@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_edge_tree import bumpy_sphere
 
-from rimlight.edge_sampling import Geometry, Motion, ShadingBoundary, derivative_image, find_edges
+from rimlight.edge_sampling import EdgeTree, Geometry, Motion, ShadingBoundary, derivative_image, find_edges
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
 SIDE = [1, 0.3, 0.2]
@@ -217,7 +217,9 @@ def test_points_on_the_lines_of_edges():
     motion.apply(theta)
     dr.forward(theta, dr.ADFlag.ClearEdges)
     geometry = Geometry.of(scene)
-    shading = ShadingBoundary(scene, geometry, find_edges(geometry), geometry.moving(), everything=True)
+    tree = EdgeTree.by_motion(geometry, find_edges(geometry), None)
+    tree.refit(dr.detach(geometry.positions()))
+    shading = ShadingBoundary(scene, tree, geometry.moving())
     shading.refit()
     x, z, count = [-0.5, 0.5, 0, 0.25, 0.7, -2, 0.5, 0.1], [0, 0, 0, 0, 0, 0, -0.25, -0.25], 256
     target = mi.Point3f(dr.repeat(mi.Float(x), count), 0, dr.repeat(mi.Float(z), count))

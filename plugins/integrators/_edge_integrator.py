@@ -13,9 +13,11 @@ from mitsuba.ad.integrators.common import ADIntegrator
 from rimlight._plan import Plan, PlannedTerm, names
 from rimlight.edge_sampling import (
     Edges,
+    EdgeTree,
     FilmBoundary,
     Geometry,
     ShadingBoundary,
+    ShadowBoundary,
     find_edges,
     intersecting_meshes,
     jumping_textures,
@@ -27,9 +29,12 @@ from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, up_to_horizon
 
 HARD_SHADOWS = (
-    "the derivative lacks the motion of the hard shadows of point, spot and directional lights; "
-    'give them a size, or set "sppi" to 0 to accept this.'
+    "the derivative has the hard shadows of lights without size (point, spot, directional, ...) on what the camera "
+    'sees, but lacks those in indirect light; give the lights a size, or set "max_depth" to 2 to leave it out.'
 )
+
+#: Parameters of a light that move the shadows in it.
+PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius")
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
 LINE = 16
@@ -77,10 +82,16 @@ class Boundaries:
     does. Nothing where nothing moves. `limits` : what the derivative will lack."""
 
     film: FilmBoundary | None = None
+    shadows: ShadowBoundary | None = None
     shading: ShadingBoundary | None = None
     moving: tuple[bool, ...] = ()
     camera_moves: bool = False
+    lights_move: bool = False
     limits: tuple[str, ...] = ()
+
+    @property
+    def tree(self) -> EdgeTree | None:
+        return next((b.tree for b in (self.shadows, self.shading) if b is not None), None)
 
 
 class EdgeIntegrator(ADIntegrator):
@@ -263,8 +274,8 @@ class EdgeIntegrator(ADIntegrator):
             sampler,
             choice,
             chosen,
-            share_emission=at_first & shading.from_lights_possible,
-            emission=~at_first | shading.emission_from_points,
+            share_emission=at_first,
+            emission=~at_first | shading.emission_at_first,
             scattering=self.depths.scatters(vertex.depth + 1),
             scattered=scattered,
         )
@@ -289,15 +300,15 @@ class EdgeIntegrator(ADIntegrator):
         # samples of boundaries, of weight zero, are normalised as the image is, for every filter.
         sampler, weights = self._sampler(sensor, seed, sppc or 16)
         terms = [lambda: self._interior(scene, sensor, sampler, weights, mode, sppc > 0)]
-        film, shading = boundaries.film, boundaries.shading
-        if film is not None and sppp > 0:
-            terms.append(lambda: self._film_boundary(scene, sensor, seed, sppp, weights, film))
-        if shading is not None and sppi > 0:
-            shading.refit()
-            if shading.from_lights_possible:
-                terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, mode, shading))
-            if self._looks_from_points(shading):
-                terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, mode, shading))
+        if boundaries.film is not None and sppp > 0:
+            terms.append(lambda: self._film_boundary(scene, sensor, seed, sppp, weights, boundaries.film))
+        if boundaries.tree is not None:
+            boundaries.tree.refit(dr.detach(boundaries.tree.geometry.positions()))
+        if boundaries.shadows is not None:
+            terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, boundaries))
+        if boundaries.shading is not None:
+            boundaries.shading.refit()
+            terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, mode, boundaries.shading))
         return sensor.film(), terms
 
     def _interior(self, scene, sensor, sampler, weights, mode, wanted: bool) -> Term:
@@ -322,14 +333,14 @@ class EdgeIntegrator(ADIntegrator):
             value = Sample(mi.Spectrum(s.value * weights), s.alpha * weights)
             return Term(s.position, value, s.wavelengths, 0.0, 0)
 
-    def _shadows(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
-        """Shadows at the first vertex, found from the lights."""
+    def _shadows(self, scene, sensor, seed, sppi, weights, boundaries: Boundaries) -> Term:
+        """Shadows on what the camera sees, found from the lights."""
         sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
-        rays = CutRays(mode)
-        s = shading.from_lights(scene, sensor, sampler, self._first_hit, rays)
+        share = boundaries.shading is not None and boundaries.shading.emission_at_first
+        s = boundaries.shadows.sample(scene, sensor, sampler, self._first_hit, share=share)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(s.value * weights), mi.Float(0))
-            return Term(s.position, value, s.wavelengths, 0.0, 0, rays=rays)
+            return Term(s.position, value, s.wavelengths, 0.0, 0)
 
     def _from_points(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
         """Boundaries as seen from one vertex of each path."""
@@ -368,7 +379,7 @@ class EdgeIntegrator(ADIntegrator):
             boundaries = self._boundaries_of(scene, sensor, sppi)
         width, height = self._size(sensor.film())
         pixels, segments = width * height, min(self.depths.max_depth, LONG)
-        film, shading = boundaries.film, boundaries.shading
+        film, shadows, shading = boundaries.film, boundaries.shadows, boundaries.shading
         path = 1 + 2 * max(segments - 1, 0)
         terms = [
             PlannedTerm("interior", sppc * pixels, path + (segments > 2) * 2 * (path - 3), "always")
@@ -380,40 +391,40 @@ class EdgeIntegrator(ADIntegrator):
             samples = samples if needed else 0
             terms.append(PlannedTerm(name, samples, rays if samples else 0, why if samples else why_not))
 
-        still = "nothing moves" if film is None else '"sppi" is 0' if not sppi else "nothing is lit"
+        moves = any(boundaries.moving) or boundaries.camera_moves or boundaries.lights_move
+        still = "nothing moves" if not moves else '"sppi" is 0' if not sppi else "nothing is lit"
         add(
             "film boundary",
             self._line_samples(sensor, sppp),
             2 * path,
             film is not None and sppp,
             f"{film.edges.count if film else 0} edges may move on the film",
-            "nothing moves" if film is None else '"sppp" is 0',
+            '"sppp" is 0' if film is not None else "only lights move" if moves else "nothing moves",
         )
-        lights = shading is not None and shading.from_lights_possible
         add(
             "shadows from lights",
             sppi * pixels,
             3,
-            lights,
-            f"{dr.width(shading.surface_lights) if lights else 0} lights of finite size",
-            still if shading is None else "no light of finite size",
+            shadows is not None,
+            f"{len(shadows) if shadows is not None else 0} lights",
+            still if shading is None else "no lights but the environment",
         )
         add(
             "edges from points",
             sppi * pixels,
             1 + path,
-            shading is not None and self._looks_from_points(shading),
+            shading is not None,
             "light that is scattered may be occluded" if segments > 2 else "glossy surfaces, or an environment",
-            still if shading is None else "diffuse surfaces in direct light: found from the lights",
+            still if shadows is None else "direct light: found from the lights",
         )
         meshes = zip(self._geometry.meshes, boundaries.moving, strict=False)
         return Plan(
             integrator=self.name,
             moving=names(m for m, moves in meshes if moves),
             camera_moves=boundaries.camera_moves,
-            lights_move=film is not None and self._lights_move(boundaries.moving),
+            lights_move=boundaries.lights_move,
             edges=len(self._edges),
-            tree=shading.tree.leaf_offsets[-1] if shading is not None else 0,
+            tree=boundaries.tree.leaf_offsets[-1] if boundaries.tree is not None else 0,
             terms=tuple(terms),
             limits=boundaries.limits,
         )
@@ -448,33 +459,26 @@ class EdgeIntegrator(ADIntegrator):
             moving = geometry.moving()
             camera = mi.traverse(sensor)
             camera_moves = any(dr.grad_enabled(value) for _, value in camera.items())
-            lights = [mi.traverse(e) for e in scene.emitters() if e.flags() & mi.EmitterFlags.Delta]
-            light_moves = any(dr.grad_enabled(p[k]) for p in lights for k in ("position", "to_world") if k in p)
+            lights_move = self._lights_move(scene, moving)
         if camera_moves and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
             raise RuntimeError(
                 f"{self.name}: the camera moves past {names}, whose silhouettes cannot be sampled yet. "
                 "Replace them by meshes."
             )
-        if light_moves and sppi > 0:
-            self._warn_once(HARD_SHADOWS)
-        if not camera_moves and not any(moving):
+        if not (camera_moves or lights_move or any(moving)):
             return Boundaries()
-        key = (moving, camera_moves, sppi > 0)
+        key = (moving, camera_moves, lights_move, sppi > 0)
         if key not in self._boundaries:
             self._refuse_while_recording()
             limits = self._limits(scene, moving, camera_moves, sppi)
             for limit in limits:
                 self._warn_once(limit)
             on_film = tuple(m or camera_moves for m in moving)
-            edges = self._edges.of_meshes(np.array(on_film))
-            self._boundaries[key] = Boundaries(
-                FilmBoundary(geometry, edges, geometry.faces(on_film)),
-                self._shading_boundary(scene, moving, camera_moves) if sppi > 0 else None,
-                moving,
-                camera_moves,
-                limits,
-            )
+            edges = self._edges.of_meshes(np.array(on_film, bool))
+            film = FilmBoundary(geometry, edges, geometry.faces(on_film)) if any(on_film) else None
+            shadows, shading = self._light_boundaries(scene, moving, camera_moves or lights_move, sppi)
+            self._boundaries[key] = Boundaries(film, shadows, shading, moving, camera_moves, lights_move, limits)
         if self._boundaries[key].shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
             self._boundaries[key].shading.boxes.find_shapes()
         return self._boundaries[key]
@@ -486,24 +490,30 @@ class EdgeIntegrator(ADIntegrator):
                 "`@dr.freeze(state_fn=lambda scene, integrator, *_: integrator.find_boundaries(scene))`."
             )
 
-    def _shading_boundary(self, scene, moving, camera_moves) -> ShadingBoundary | None:
-        if not scene.emitters() or not len(self._edges) or not self.depths.scatters(1):
-            return None
-        everything = camera_moves or self._lights_move(moving)
-        return ShadingBoundary(scene, self._geometry, self._edges, moving, everything=everything)
+    def _light_boundaries(
+        self, scene, moving, everything, sppi
+    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None]:
+        """What samples the edges of which lights and shading points know, as far as it is needed."""
+        if not sppi or not scene.emitters() or not len(self._edges) or not self.depths.scatters(1):
+            return None, None
+        tree = EdgeTree.by_motion(self._geometry, self._edges, None if everything else moving)
+        shadows, shading = ShadowBoundary(scene, tree), ShadingBoundary(scene, tree, moving)
+        needed = self.depths.scatters(2) or shading.emission_at_first
+        return shadows if len(shadows) else None, shading if needed else None
 
-    def _looks_from_points(self, shading: ShadingBoundary) -> bool:
-        """Diffuse surfaces in direct light find all that is lit from the lights."""
-        return bool(self.depths.scatters(2)) or shading.emission_from_points
-
-    def _lights_move(self, moving) -> bool:
-        return any(m.is_emitter() and moves for m, moves in zip(self._geometry.meshes, moving, strict=True))
+    def _lights_move(self, scene, moving) -> bool:
+        """Do meshes that emit light move, or lights that are no shapes?"""
+        if any(m.is_emitter() and moves for m, moves in zip(self._geometry.meshes, moving, strict=True)):
+            return True
+        others = [mi.traverse(e) for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
+        return any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
 
     def _limits(self, scene, moving, camera_moves, sppi) -> tuple[str, ...]:
         """What the derivative will lack."""
         limits = []
         geometry = self._geometry
-        if sppi > 0 and any(e.flags() & mi.EmitterFlags.Delta for e in scene.emitters()):
+        delta = any(e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
+        if sppi > 0 and delta and self.depths.scatters(2):
             limits.append(HARD_SHADOWS)
         if sppi > 0 and any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes()):
             limits.append(

@@ -28,7 +28,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
 
      * - sppi
        - |int|
-       - Samples per pixel of the boundaries at shading points (soft shadows, lights in rough surfaces); likewise.
+       - Samples per pixel of the boundaries of shadows, and at shading points (lights in rough surfaces); likewise.
 
      * - hide_emitters
        - |bool|
@@ -43,9 +43,9 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     boundary unless something occludes it.
 
     **Limits.** Only triangle meshes can move: a moving sphere, curve, instance, ... is refused, and so is a camera
-    that moves past one. Missing, with a warning: the hard shadows of point, spot and directional lights, the motion of
-    what perfect mirrors and glass show, the jumps of textures (``checkerboard``, ``nearest`` filters), the lines in
-    which meshes cut through each other, and shadows of spheres, curves, ... on what moves. At the outline of a
+    that moves past one. Missing, with a warning: the motion of what perfect mirrors and glass show, the jumps of
+    textures (``checkerboard``, ``nearest`` filters), the lines in which meshes cut through each other, and shadows of
+    spheres, curves, ... on what moves. At the outline of a
     smooth-shaded mesh, the dark fringe of normals that face away is taken as infinitely thin (see the theory), which
     leaves a bias of the order of its width: about 2 % on a torus of 48 × 24 quads at 32². Polarised variants are
     refused. With filters other than ``box``, the ratio of sums that makes a pixel has a bias of order 1/spp, as it

@@ -52,8 +52,8 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     (Zhang et al. 2020); the first is met by a ray that is fixed on the film.
 
     **Boundaries at shading points.** Each path keeps *one* of its vertices, chosen by a reservoir in proportion to
-    throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows that
-    lights of finite size cast on what the camera sees are found from the lights.
+    throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows on
+    what the camera sees, hard ones too, are found from the lights.
 
     **Limits.** Those of ``direct_edge``, but for interreflections; what perfect mirrors and glass show is taken not to
     move, with a warning. In corners of rooms, the derivative with respect to the camera has infinite variance: it is
