@@ -12,6 +12,7 @@ from .motion import Motion, derivative_image
 from .projection import Projection
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary, ShadowSamples
+from .silhouettes import Silhouettes
 from .zscores import mean_and_error, z_scores
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "ShadingBoundary",
     "ShadowBoundary",
     "ShadowSamples",
+    "Silhouettes",
     "View",
     "derivative_image",
     "find_edges",

@@ -47,19 +47,11 @@ class DeviceEdges:
         from somewhere, their normals point to the same side. The first is that of its face, as its vertices turn.
         """
         a, b = self.end_points(positions, edge)
-        opposite = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, o, edge)) for o in self._opposite]
-        return [dr.cross(b - a, o - a) for o in opposite]
+        return [dr.cross(b - a, o - a) for o in self.opposite(positions, edge)]
 
-    def outward(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, across: mi.Vector3f) -> mi.Float:
-        """The side of a silhouette on which its faces are not: the sign of `across`, (N,); 0 where they are on both.
-
-        across : a direction across the edge and the line of sight, at the point p of the edge.
-        """
-        sides = []
-        for opposite in self._opposite:
-            o = dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, opposite, edge))
-            sides.append(dr.sign(dr.dot(o - p, across)))
-        return dr.select(sides[0] == sides[1], -sides[0], 0)
+    def opposite(self, positions: mi.Float, edge: mi.UInt32) -> list[mi.Point3f]:
+        """The third vertex of the face on each side, world space."""
+        return [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, o, edge)) for o in self._opposite]
 
     def is_hidden_fold(
         self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]
@@ -75,10 +67,11 @@ class DeviceEdges:
         # Half-way between the rays is the line of sight itself: faces may be closer to it than the rays are.
         line_of_sight = p - dr.lerp(rays[0].o, rays[1].o, 0.5)
         fold = dr.gather(mi.Bool, self._two_faces, edge)
-        fold &= self.outward(positions, edge, p, dr.cross(b - a, line_of_sight)) == 0
+        across = dr.cross(b - a, line_of_sight)
+        opposite = self.opposite(positions, edge)
+        fold &= dr.sign(dr.dot(opposite[0] - p, across)) != dr.sign(dr.dot(opposite[1] - p, across))
         passed = [mi.Bool(False), mi.Bool(False)]
-        for opposite in self._opposite:
-            o = dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, opposite, edge))
+        for o in opposite:
             for k, ray in enumerate(rays):
                 corners = [c - ray.o for c in (a, b, o)]
                 turns = [dr.dot(ray.d, dr.cross(corners[i], corners[i - 1])) for i in range(3)]

@@ -139,12 +139,6 @@ class EdgeTree:
         self.nodes = [dr.zeros(mi.Float, self.node_offsets[-1] * 4) for _ in range(NODE_PACKETS)]
         self.slots = [dr.zeros(mi.Float, self.leaf_offsets[-1] * LEAF * 4) for _ in range(SLOT_PACKETS)]
 
-    @classmethod
-    def by_motion(cls, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None) -> EdgeTree:
-        """Moving edges first, the others in a tree of their own; or all in one, if `moving` (by mesh) is None."""
-        moves = np.ones(len(edges), bool) if moving is None else np.array(moving)[edges.mesh].any(axis=1)
-        return cls(geometry, edges, [np.flatnonzero(m) for m in (moves, ~moves) if m.any()])
-
     @property
     def bytes(self) -> int:
         """Memory of the tree on the device, without the edges that it is over."""

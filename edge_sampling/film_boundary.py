@@ -7,7 +7,8 @@ For a pixel with filter k, I = ∫ k(u) L(u) du. Where an edge moves with the ve
 (Li et al. 2018, Eq. 7, with the edge function's gradient written as a velocity). With the edge as a curve u(t), the
 length element and the normal join to n dl = (−u'ᵧ, u'ₓ) dt, so that neither is ever normalised.
 
-Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces.
+Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces, and
+at the outlines of spheres, disks and cylinders.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .curves import Curves
 from .device_edges import DeviceEdges
 from .edges import Edges
 from .meshes import Geometry
@@ -50,18 +52,24 @@ class FilmBoundary:
 
     Parameters
     ----------
-    geometry : the meshes.
-    edges : the edges that can move over the film, on the host.
-    faces : (F, 3), vertex indices of the faces that can, on the host.
+    geometry : the shapes.
+    edges : of their meshes, on the host.
+    moving : see `Geometry.moving`; which of them can move over the film.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "count"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "curves", "counts"))  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry, edges: Edges, faces: np.ndarray):
+    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray):
         self.geometry = geometry
-        self.edges = DeviceEdges(edges)
-        self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)]
-        self.count = len(edges) + len(faces)
+        edges, faces = edges.of_meshes(moving), geometry.faces(moving)
+        # (Dr.Jit 1.5 cannot freeze empty arrays.)
+        self.edges = DeviceEdges(edges) if len(edges) else None
+        self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
+        shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
+        shapes = tuple(s for s, moves in shapes if moves)
+        self.curves = Curves(shapes) if shapes else None
+        #: How many edges, then cuts through faces, then pieces of curves there are.
+        self.counts = (len(edges), len(faces) if len(edges) else 0, len(self.curves) if shapes else 0)
 
     def sample(
         self,
@@ -86,32 +94,42 @@ class FilmBoundary:
         with dr.resume_grad():
             projection = Projection(sensor)
             positions = self.geometry.positions()
+            frames = self.curves.frames() if self.curves is not None else None
         with dr.suspend_grad():
             aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
-            edge, along, density = self._choose(projection, positions, sensor.film(), sampler, count)
-            a, b = self._end_points(projection, positions, edge)
-            segment = _clip(projection, projection.film(a), projection.film(b), sensor.film())
-            t, dt = segment.parameter(along)
-            along_film = tangent(projection, a, b, t, aperture_sample)
+            index, along, density = self._choose(projection, positions, frames, sensor.film(), sampler, count)
+            is_edge, is_line = index < self.counts[0], index < sum(self.counts[:2])
+            along_film, valid = mi.Vector2f(0), mi.Bool(False)
+            if self.edges is not None:
+                a, b = self._end_points(projection, positions, index)
+                visible = _clip(projection, projection.film(a), projection.film(b), sensor.film())
+                t, dt = visible.parameter(along)
+                along_film, valid = tangent(projection, a, b, t, aperture_sample) * dt, is_line & (visible.length > 0)
+            if self.curves is not None:
+                eye = -projection.view() if projection.orthographic else projection.eye(aperture_sample)
+                piece = dr.select(is_line, 0, index - sum(self.counts[:2]))
+                c = self.curves.point(frames, piece, along, eye, projection.orthographic)
+                on_film = tangent(projection, c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), aperture_sample)
+                along_film = dr.select(is_line, along_film, on_film)
+                valid |= ~is_line & c.valid & (projection.film(c.p).z > projection.near)
 
         # Only here does the gradient enter: the velocity of a point that is fixed on the edge.
         with dr.resume_grad():
-            a, b = self._end_points(projection, positions, edge)
-            u = projection.film(dr.lerp(a, b, t), aperture_sample).position()
+            p = mi.Point3f(0)
+            if self.edges is not None:
+                p = dr.lerp(*self._end_points(projection, positions, index), t)
+            if self.curves is not None:
+                c = self.curves.point(frames, piece, along, eye, projection.orthographic)
+                p = dr.select(is_line, p, c.p)
+            u = projection.film(p, aperture_sample).position()
             velocity = u - dr.detach(u)
 
         with dr.suspend_grad():
-            n_dl = mi.Vector2f(-along_film.y, along_film.x) * (dt / density)
+            n_dl = mi.Vector2f(-along_film.y, along_film.x) / density
             n = dr.normalize(n_dl)
-            u = dr.detach(u)
-            p = dr.lerp(a, b, t)
+            u, p = dr.detach(u), dr.detach(p)
             offset = self._offset(projection, p) * n
-            active = (
-                (density > 0)
-                & (segment.length > 0)
-                & dr.isfinite(dr.squared_norm(n_dl))
-                & inside_frame(u, sensor.film())
-            )
+            active = (density > 0) & valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             time = sensor.shutter_open()
             if sensor.shutter_open_time() > 0:
                 time += sampler.next_1d() * sensor.shutter_open_time()
@@ -128,8 +146,8 @@ class FilmBoundary:
                 )
                 rays.append(ray)
                 weights.append(weight)
-            is_edge = edge < self.edges.count
-            active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, edge, 0), p, rays))
+            if self.edges is not None:
+                active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, index, 0), p, rays))
             for sign, ray, weight in zip((-1, 1), rays, weights, strict=True):
                 L, alpha = radiance(ray, sampler.clone(), active)
                 jump -= sign * L * weight
@@ -143,51 +161,88 @@ class FilmBoundary:
             return BoundarySamples(u, jump * normal_velocity, alpha_jump * normal_velocity, ray.wavelengths)
 
     def _choose(
-        self, projection: Projection, positions: mi.Float, film: mi.Film, sampler: mi.Sampler, count: int
+        self,
+        projection: Projection,
+        positions: mi.Float,
+        frames: mi.Float | None,
+        film: mi.Film,
+        sampler: mi.Sampler,
+        count: int,
     ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Choose edges in proportion to their length on the film.
 
         Returns
         -------
-        edge : mi.UInt32, (count,)
+        index : mi.UInt32, (count,), of an edge, a cut, or a piece of a curve
         along : mi.Float, (count,), position along its visible part, uniform in [0, 1) on the film.
         density : mi.Float, (count,), expected number of samples on the edge; 0 where no edge is visible.
         """
-        length = self._visible_length(projection, positions, film)
+        length, last = self._visible_length(projection, positions, frames, film), sum(self.counts) - 1
         quantised = mi.UInt64(dr.ceil(mi.Float64(length) / LENGTH_UNIT))
         cumulative = dr.cumsum(quantised)
-        total = mi.Float64(dr.gather(mi.UInt64, cumulative, self.count - 1))
+        total = mi.Float64(dr.gather(mi.UInt64, cumulative, last))
         x = (mi.Float64(dr.arange(mi.UInt32, count)) + mi.Float64(sampler.next_1d())) * (total / count)
         whole = mi.UInt64(x)
-        edge = dr.binary_search(0, self.count - 1, lambda i: dr.gather(mi.UInt64, cumulative, i) <= whole)
-        size = mi.Float64(dr.gather(mi.UInt64, quantised, edge))
-        start = mi.Float64(dr.gather(mi.UInt64, cumulative, edge)) - size
+        index = dr.binary_search(0, last, lambda i: dr.gather(mi.UInt64, cumulative, i) <= whole)
+        size = mi.Float64(dr.gather(mi.UInt64, quantised, index))
+        start = mi.Float64(dr.gather(mi.UInt64, cumulative, index)) - size
         along = dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float))
-        return edge, along, dr.select(total > 0, mi.Float(count * size / total), 0)
+        return index, along, dr.select(total > 0, mi.Float(count * size / total), 0)
 
-    def _visible_length(self, projection: Projection, positions: mi.Float, film: mi.Film) -> mi.Float:
-        """Length inside the frame of each edge and cut, 0 where nothing can jump: (E + F,), pixels on the film."""
-        edge, face = dr.arange(mi.UInt32, self.edges.count), dr.arange(mi.UInt32, self.count - self.edges.count)
-        jumps = self.edges.is_boundary(
-            positions,
-            edge,
-            projection.eye(),
-            view=projection.view() if projection.orthographic else None,
-            radius=projection.lens_radius(),
-            geometry=self.geometry,
-        )
+    def _visible_length(
+        self, projection: Projection, positions: mi.Float, frames: mi.Float | None, film: mi.Film
+    ) -> mi.Float:
+        """Length inside the frame of each edge, cut and piece of a curve, 0 where nothing can jump: pixels on the film;
+        of curves, an estimate."""
         lengths = []
-        for a, b in (self.edges.end_points(positions, edge), self._cut(projection, positions, face)):
-            lengths.append(_clip(projection, projection.film(a), projection.film(b), film).length)
-        return dr.concat([dr.select(jumps, lengths[0], 0), lengths[1]])
+        if self.edges is not None:
+            edge, face = (dr.arange(mi.UInt32, n) for n in self.counts[:2])
+            jumps = self.edges.is_boundary(
+                positions,
+                edge,
+                projection.eye(),
+                view=projection.view() if projection.orthographic else None,
+                radius=projection.lens_radius(),
+                geometry=self.geometry,
+            )
+            for a, b in (self.edges.end_points(positions, edge), self._cut(projection, positions, face)):
+                lengths.append(_clip(projection, projection.film(a), projection.film(b), film).length)
+            lengths[0] = dr.select(jumps, lengths[0], 0)
+        if self.curves is not None:
+            lengths.append(self._curve_length(projection, frames, film))
+        return dr.concat(lengths) if len(lengths) > 1 else lengths[0]
+
+    def _curve_length(self, projection: Projection, frames: mi.Float, film: mi.Film) -> mi.Float:
+        """About the length of each piece of a curve, 0 only where it is certainly out of the frame."""
+        piece = dr.arange(mi.UInt32, self.counts[2])
+        eye = -projection.view() if projection.orthographic else projection.eye()
+        lower, upper = frame(film)
+        points = [
+            projection.film(self.curves.point(frames, piece, mi.Float(t), eye, projection.orthographic).p)
+            for t in (0, 0.5, 1)
+        ]
+        start, middle, end = (q.position() for q in points)
+        length = dr.norm(middle - start) + dr.norm(end - middle)
+        size = dr.norm(mi.Vector2f(upper - lower))
+        # Another point of the lens may see all of it elsewhere.
+        blur = sum(projection.blur(q) / dr.abs(q.w) for q in points)
+        outside = mi.Bool(False)
+        for i in (0, 1):
+            outside |= (middle[i] + length + blur < lower[i]) | (middle[i] - length - blur > upper[i])
+        in_front = [q.z > projection.near for q in points]
+        whole = in_front[0] & in_front[1] & in_front[2] & dr.isfinite(length)
+        length = dr.select(outside, 0, dr.minimum(length, size) + LENGTH_UNIT)
+        length = dr.select(whole, length, dr.select(in_front[0] | in_front[1] | in_front[2], size, 0))
+        return length
 
     def _end_points(
         self, projection: Projection, positions: mi.Float, index: mi.UInt32
     ) -> tuple[mi.Point3f, mi.Point3f]:
         """End points of edges, or beyond their number of cuts: world space."""
-        is_edge = index < self.edges.count
+        edges, faces, _ = self.counts
+        is_edge, is_face = index < edges, (index >= edges) & (index < edges + faces)
         edge = self.edges.end_points(positions, dr.select(is_edge, index, 0))
-        cut = self._cut(projection, positions, dr.select(is_edge, 0, index - self.edges.count))
+        cut = self._cut(projection, positions, dr.select(is_face, index - edges, 0))
         return tuple(dr.select(is_edge, e, c) for e, c in zip(edge, cut, strict=True))
 
     def _cut(self, projection: Projection, positions: mi.Float, face: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:

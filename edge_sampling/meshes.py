@@ -9,29 +9,33 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .curves import CURVES
+
 
 @dataclass(frozen=True)
 class Geometry:
     """The shapes of a scene, sorted by what can be done with them.
 
     meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known.
-    others : shapes without edges here (spheres, curves, instances, ...). They occlude and receive light, but must not
-        move.
+    analytic : spheres, disks, cylinders, whose outlines are known curves.
+    others : all else (instances, hair, ...). They occlude and receive light, but must not move.
     """
 
     meshes: tuple[Any, ...]
-    others: tuple[Any, ...]
+    analytic: tuple[Any, ...] = ()
+    others: tuple[Any, ...] = ()
 
     @staticmethod
     def of(scene: mi.Scene) -> Geometry:
         shapes = scene.shapes()
         meshes = tuple(s for s in shapes if s.is_mesh() and s.class_name() != "EllipsoidsMesh")
-        others = tuple(s for s in shapes if s not in meshes)
-        return Geometry(meshes, others)
+        analytic = tuple(s for s in shapes if s.class_name() in CURVES)
+        return Geometry(meshes, analytic, tuple(s for s in shapes if s not in meshes and s not in analytic))
 
     def key(self) -> tuple[tuple[int, int, int], ...]:
         """What must stay the same for the edges found earlier to be valid: which meshes there are, and their sizes."""
-        return tuple((int(m.ptr), m.vertex_count(), m.face_count()) for m in self.meshes)
+        meshes = tuple((int(m.ptr), m.vertex_count(), m.face_count()) for m in self.meshes)
+        return meshes + tuple((int(s.ptr), 0, 0) for s in self.analytic)
 
     def faces(self, wanted: tuple[bool, ...]) -> np.ndarray:
         """Faces of the meshes that are `wanted`: (F, 3), indices into `positions`, on the host."""
@@ -40,24 +44,25 @@ class Geometry:
         return np.concatenate(chosen) if chosen else np.zeros((0, 3), np.uint32)
 
     def moving(self) -> tuple[bool, ...]:
-        """For every mesh: do its vertices carry a gradient?"""
-        return tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
+        """For every mesh, and then for every analytic shape: does it move?"""
+        meshes = tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
+        return meshes + tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
 
     def refuse_moving_others(self, scene: mi.Scene, who: str) -> None:
         """Refuse derivatives with respect to shapes whose silhouettes are not known, inside of shape groups, too.
 
         Raises
         ------
-        RuntimeError : a shape that is none of `meshes` carries a gradient in one of its own parameters.
+        RuntimeError : one of `others`, or a shape in a group, carries a gradient in one of its own parameters.
         """
-        known = {int(m.ptr) for m in self.meshes}
+        known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
         params = mi.traverse(scene)
         for key, (_, _, node, _) in params.properties.items():
             if isinstance(node, mi.Shape) and int(node.ptr) not in known and dr.grad_enabled(params[key]):
                 raise RuntimeError(
                     f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{key}" carries a gradient), but its '
-                    "silhouettes cannot be sampled yet: only triangle meshes outside of shape groups can move. "
-                    "Replace it by such a mesh, or detach it."
+                    "silhouettes cannot be sampled: only triangle meshes, spheres, disks and cylinders outside of "
+                    "shape groups can move. Replace it by such a mesh, or detach it."
                 )
 
     def positions(self) -> mi.Float:

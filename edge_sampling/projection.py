@@ -88,9 +88,12 @@ class Projection:
         sample = mi.Vector2f(h.x, h.y) - self.principal_point * h.w
         return FilmPoint(mi.Point2f(sample * self.crop_size + self.crop_offset * h.w), h.w, q.z)
 
-    def eye(self) -> mi.Point3f:
-        """Centre of the lens, world space. Detached."""
-        return dr.detach(self.to_world) @ mi.Point3f(0)
+    def eye(self, aperture_sample: mi.Point2f | None = None) -> mi.Point3f:
+        """Centre of the lens, or the point of it that `aperture_sample` stands for: world space. Detached."""
+        lens = mi.Point2f(0)
+        if aperture_sample is not None:
+            lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample) * self.lens_radius()
+        return dr.detach(self.to_world) @ mi.Point3f(lens.x, lens.y, 0)
 
     def view(self) -> mi.Vector3f:
         """Optical axis, world space, unit length. Detached."""

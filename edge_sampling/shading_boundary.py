@@ -25,9 +25,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .device_edges import beside_edge
-from .edge_importance import EdgeSample, Lobe, View, power_heuristic, resample, sample_edge
-from .edge_tree import EdgeTree
+from .edge_importance import EdgeSample, Lobe, View, power_heuristic, resample
 from .emitter_boxes import EmitterBoxes
+from .silhouettes import Placement, Silhouettes
 
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
@@ -48,20 +48,18 @@ class ShadingBoundary:
     Parameters
     ----------
     scene : mi.Scene
-    tree : over all edges; those that move are a group of their own, unless all edges matter everywhere. Refitted by the
-        caller.
-    moving : for every mesh, does it move?
+    silhouettes : of all shapes; refitted by the caller.
+    moving : the shapes that move. At points that stand still, only the first group of edges matters then; None: all
+        edges matter at all points.
     """
 
-    _NUMBERS = ("everything", "transmits", "glossy", "emission", "emission_at_first")
-    DRJIT_STRUCT = dict.fromkeys(("tree", "boxes", "moving_shapes", "lights", *_NUMBERS))  # for `dr.freeze`
+    _NUMBERS = ("transmits", "glossy", "emission", "emission_at_first")
+    DRJIT_STRUCT = dict.fromkeys(("silhouettes", "boxes", "moving_shapes", "lights", *_NUMBERS))  # for `dr.freeze`
 
-    def __init__(self, scene: mi.Scene, tree: EdgeTree, moving: tuple[bool, ...]):
-        self.tree = tree
-        self.geometry = geometry = tree.geometry
-        self.moving_shapes = [mi.ShapePtr(m) for m, moves in zip(geometry.meshes, moving, strict=True) if moves]
-        #: Do all edges matter at all points? Otherwise at points that stand still only moving edges do.
-        self.everything = len(tree.depths) == 1
+    def __init__(self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None):
+        self.silhouettes = silhouettes
+        self.geometry = geometry = silhouettes.geometry
+        self.moving_shapes = None if moving is None else [mi.ShapePtr(s) for s in moving]
         self.boxes = EmitterBoxes(scene, geometry)
         emitters = scene.emitters()
         #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
@@ -85,7 +83,7 @@ class ShadingBoundary:
     def from_points(
         self,
         scene: mi.Scene,
-        positions: mi.Float,
+        placement: Placement,
         si: mi.SurfaceInteraction3f,
         sampler: mi.Sampler,
         choice: mi.Float,
@@ -99,7 +97,7 @@ class ShadingBoundary:
         """One sample of the boundary integral at each of `si`: of the light that a light emits, or of light that is
         scattered.
 
-        positions : of the vertices, from `Geometry.positions`; attached. Made before `si`: in backward mode, their
+        placement : of the shapes, from `Silhouettes.placement`; attached. Made before `si`: in backward mode, its
             gradients are then complete before they are passed on, which takes one kernel, and not two.
         si : attached to whatever moves it.
         choice : see `sample_edge`.
@@ -113,8 +111,8 @@ class ShadingBoundary:
         """
         with dr.suspend_grad():
             bsdf = si.bsdf()
-            moves = mi.Bool(self.everything)
-            for shape in self.moving_shapes:
+            moves = mi.Bool(self.moving_shapes is None)
+            for shape in self.moving_shapes or ():
                 moves |= si.shape == shape
             active = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -135,27 +133,29 @@ class ShadingBoundary:
 
             facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
             view = View(
-                mi.Vector3f(si.p - self.tree.centre),
+                mi.Vector3f(si.p - self.silhouettes.centre),
                 facing,
                 dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), dr.inv_pi, 0.1 * dr.inv_pi),
                 [self._lobe(si, bsdf, sampler, active)] if self.glossy else [],
                 cone,
             )
-            use = [1] if self.everything else [1, dr.select(moves, 1, 0)]
+            use = [1, dr.select(moves, 1, 0)][: self.silhouettes.groups]
 
             def draw(k, sampler):
                 part = (choice + k) / CANDIDATES
-                return sample_edge(self.tree, view, sampler, use, choice=part, from_light=False, active=active)
+                return self.silhouettes.sample(
+                    placement, view, sampler, use, choice=part, from_light=False, active=active
+                )
 
             def unshadowed(e):
-                a, b = self.tree.device_edges.end_points(positions, e.edge)
-                d = dr.lerp(a, b, e.t) - si.p
+                outline = self.silhouettes.point(placement, e, si.p)
+                d = outline.p - si.p
                 f = bsdf.eval(mi.BSDFContext(), si, si.to_local(dr.normalize(d)), active)
-                return dr.max(f) * dr.norm(dr.cross(d, b - a)) * dr.rcp(dr.squared_norm(d))
+                return dr.max(f) * dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(dr.squared_norm(d))
 
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
             e.density *= dr.select(emission, p / lights, 1 - p)
-        return self._evaluate(scene, positions, si, e, sampler, active, light, share_emission, emission, scattered)
+        return self._evaluate(scene, placement, si, e, sampler, active, light, share_emission, emission, scattered)
 
     @staticmethod
     def _lobe(si, bsdf, sampler, active) -> Lobe:
@@ -189,7 +189,7 @@ class ShadingBoundary:
     def _evaluate(
         self,
         scene: mi.Scene,
-        positions: mi.Float,
+        placement: Placement,
         si: mi.SurfaceInteraction3f,
         sample: EdgeSample,
         sampler: mi.Sampler,
@@ -204,20 +204,20 @@ class ShadingBoundary:
         light : the only one whose emission counts.
         emission : does emitted light count, or scattered light?
         """
-        edges = self.tree.device_edges
         with dr.suspend_grad():
-            a, b = edges.end_points(positions, sample.edge)
-            p = dr.lerp(a, b, sample.t)
             # Mitsuba's rays start above the surface: look from there.
-            lift = si.spawn_ray(p - si.p).o - si.p
+            towards = self.silhouettes.point(placement, sample, si.p).p - si.p
+            lift = si.spawn_ray(towards).o - si.p
             x = mi.Point3f(si.p + lift)
+            outline = self.silhouettes.point(placement, sample, x)
+            p = outline.p
             distance = dr.norm(p - x)
             ω = (p - x) / distance
-            n_dl = dr.cross(ω, b - a) / (distance * sample.density)
+            n_dl = dr.cross(ω, outline.tangent) / (distance * sample.density)
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
             active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
-            side = edges.outward(positions, sample.edge, p, across)
+            side = outline.outward(across)
             active &= side != 0
             n_dl = dr.select(active, n_dl, 0)
             beside = mi.Point3f(p + side * beside_edge(p, x) * across)
@@ -240,10 +240,10 @@ class ShadingBoundary:
             n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
-            a, b = edges.end_points(positions, sample.edge)
+            p = self.silhouettes.point(placement, sample, dr.detach(x)).p
             y = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, valid).p
             x = si.p + lift
-            velocity = _turning(n_dl, dr.lerp(a, b, sample.t) - x, active) - _turning(n_dl, y - x, valid)
+            velocity = _turning(n_dl, p - x, active) - _turning(n_dl, y - x, valid)
             return -side * L * velocity
 
 

@@ -22,10 +22,10 @@ import drjit as dr
 import mitsuba as mi
 
 from .device_edges import beside_edge
-from .edge_importance import View, power_heuristic, sample_edge
-from .edge_tree import EdgeTree
+from .edge_importance import View, power_heuristic
 from .lights import Lights
 from .projection import Projection, inside_frame, tangent
+from .silhouettes import Silhouettes
 
 
 def throws_shadows(emitter: mi.Emitter) -> bool:
@@ -59,13 +59,13 @@ class ShadowBoundary:
     Parameters
     ----------
     scene : mi.Scene
-    tree : over the edges that can throw shadows that move; refitted by the caller.
+    silhouettes : what throws shadows; refitted by the caller.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("tree", "lights", "chosen", "any_surface", "any_other"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("silhouettes", "lights", "chosen", "any_surface", "any_other"))  # for `dr.freeze`
 
-    def __init__(self, scene: mi.Scene, tree: EdgeTree):
-        self.tree = tree
+    def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
+        self.silhouettes = silhouettes
         self.lights = Lights(scene)
         emitters = scene.emitters()
         #: Numbers of the lights whose shadows are sampled.
@@ -93,10 +93,10 @@ class ShadowBoundary:
         first_hit : what a camera ray meets.
         share : are shadows of surfaces sampled from shading points as well?
         """
-        tree, count = self.tree, sampler.wavefront_size()
+        silhouettes, count = self.silhouettes, sampler.wavefront_size()
         with dr.resume_grad():
             projection = Projection(sensor)
-            positions = tree.geometry.positions()
+            placement = silhouettes.placement()
         with dr.suspend_grad():
             # ---------------------- A point on a light ----------------------
 
@@ -111,7 +111,7 @@ class ShadowBoundary:
             far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) if self.any_other else mi.Bool(False)
             # At infinity, the place of the point is taken by the direction towards it.
             it = dr.zeros(mi.SurfaceInteraction3f, count)
-            it.p = mi.Point3f(tree.centre)
+            it.p = mi.Point3f(silhouettes.centre)
             y, density = mi.Point3f(0), mi.Float(1)
             n = mi.Vector3f(0)
             if self.any_other:
@@ -124,19 +124,19 @@ class ShadowBoundary:
 
             # ---------------------- An edge as seen from there ----------------------
 
-            eye = dr.select(far, mi.Vector3f(y), mi.Vector3f(y - tree.centre))
+            eye = dr.select(far, mi.Vector3f(y), mi.Vector3f(y - silhouettes.centre))
             view = View(eye, n, dr.full(mi.Float, 1, count), [], far=far if self.any_other else None)
             # Shadows of edges that stand still matter only on what moves.
-            use = [1, 0.2][: len(tree.depths)]
-            e = sample_edge(tree, view, sampler, use, choice=choice, from_light=True, active=active)
+            use = [1, 0.2][: silhouettes.groups]
+            e = silhouettes.sample(placement, view, sampler, use, choice=choice, from_light=True, active=active)
             active &= e.density > 0
-            a, b = tree.device_edges.end_points(positions, e.edge)
-            p = dr.lerp(a, b, e.t)
+            outline = silhouettes.point(placement, e, y, far)
+            p = outline.p
             d = dr.select(far, -mi.Vector3f(y), p - y)
             ω = dr.normalize(d)
             cos_y = dr.select(on_surface, dr.dot(n, ω), 1)
-            across = dr.normalize(dr.cross(ω, b - a))
-            lit = across * tree.device_edges.outward(positions, e.edge, p, across)
+            across = dr.normalize(dr.cross(ω, outline.tangent))
+            lit = across * outline.outward(across)
             active &= (cos_y > 0) & dr.any(lit != 0)
 
             # ---------------------- Where its shadow falls ----------------------
@@ -211,18 +211,17 @@ class ShadowBoundary:
                 v = s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))
                 return dr.detach(tangent(projection, x, mi.Point3f(x + v), mi.Float(0), aperture_sample))
 
-            T, towards_light = on_receiver(b - a), on_receiver(lit)
+            T, towards_light = on_receiver(outline.tangent), on_receiver(lit)
             n_dl = mi.Vector2f(-T.y, T.x) / (e.density * density * (count / len(self)))
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl = dr.select(active, n_dl, 0)
             if projection.attached:
                 # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
-                dr.eval(jump, n_dl, active, seen, ray, met, onwards, light, numbers, e, far, facing, lift, u)
+                dr.eval(jump, n_dl, active, seen, ray, met, onwards, light, numbers, e, y, far, facing, lift, u)
 
         with dr.resume_grad():
-            a, b = tree.device_edges.end_points(positions, e.edge)
-            p = dr.lerp(a, b, e.t)
+            p = silhouettes.point(placement, e, y, far).p
             q = mi.Point3f(0)
             if self.any_other:
                 q = self._off_surface(scene, light, it, far, numbers, active & ~on_surface)

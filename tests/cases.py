@@ -211,7 +211,9 @@ def textured_cube() -> dict:
 
 
 def room(
-    sensor: Callable[[], dict] = camera, bsdf: Callable[[], dict] = lambda: diffuse(0.5, two_sided=True)
+    sensor: Callable[[], dict] = camera,
+    bsdf: Callable[[], dict] = lambda: diffuse(0.5, two_sided=True),
+    **more: Callable[[], Any],
 ) -> Callable[[], mi.Scene]:
     """A cube of half-side 0.6 above a floor, under an area light and a dim environment."""
 
@@ -231,6 +233,7 @@ def room(
                 "emitter": light(12, 11, 10),
             },
             environment=constant(0.2),
+            **{k: v() for k, v in more.items()},
         )
 
     return build
@@ -448,6 +451,48 @@ def sun() -> dict:
     return {"type": "directional", "direction": [0.5, -1, 0.3], "irradiance": 2.0}
 
 
+def sphere_over(*lamps: Callable[[], dict]) -> Callable[[], mi.Scene]:
+    return lambda: over_floor({"type": "sphere", "radius": 0.55, "center": [0.23, 0.1, 0]}, lamps)
+
+
+def disk_over(*lamps: Callable[[], dict]) -> Callable[[], mi.Scene]:
+    def build() -> mi.Scene:
+        to_world = mi.ScalarTransform4f().translate([0.23, 0.1, 0]).rotate([1, 0, 0], 60).scale([0.7, 0.5, 1])
+        return over_floor({"type": "disk", "to_world": to_world, "bsdf": diffuse(0.5, two_sided=True)}, lamps)
+
+    return build
+
+
+def cylinder_over(*lamps: Callable[[], dict]) -> Callable[[], mi.Scene]:
+    thing = {"type": "cylinder", "p0": [0, -0.3, 0.2], "p1": [0.5, 0.5, -0.2], "radius": 0.3}
+    return lambda: over_floor({**thing, "bsdf": diffuse(0.5, two_sided=True)}, lamps)
+
+
+def over_floor(thing: dict, lamps: tuple[Callable[[], dict], ...]) -> mi.Scene:
+    """A shape above a floor, lit by the lamps."""
+    return scene(
+        sensor=camera(),
+        floor=horizontal((0, -1, 0), 3, "floor", bsdf=diffuse(0.6, 0.5, 0.4)),
+        thing={**thing, "id": "thing"},
+        **{f"lamp{i or ''}": lamp() for i, lamp in enumerate(lamps)},
+    )
+
+
+def ceiling_light() -> dict:
+    """Of half-side 0.3."""
+    return horizontal((-0.5, 3, -0.5), 0.3, "lamp", down=True, bsdf=diffuse(0.0), emitter=light(40, 38, 36))
+
+
+def sphere_light() -> mi.Scene:
+    """A cube and its shadow on a floor, in the light of a ball."""
+    return scene(
+        sensor=camera(),
+        floor=horizontal((0, -1, 0), 3, "floor", bsdf=diffuse(0.6, 0.5, 0.4)),
+        cube=mesh("cube", 0.4 * cube_vertices() + [0.23, 0.1, 0], CUBE_FACES, bsdf=diffuse(0.4, 0.5, 0.7)),
+        lamp={"type": "sphere", "center": [-0.5, 2.5, -0.5], "radius": 0.3, "emitter": light(30, 28, 26)},
+    )
+
+
 def lit_room() -> mi.Scene:
     """A closed room with a point light and a cube."""
     walls = {}
@@ -471,6 +516,8 @@ def lit_room() -> mi.Scene:
 DEPTH = {"key": "cube.vertex_positions", "direction": [0, 0, 1]}
 SIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.2, 1, 0]}
+THING_SIDE = {"key": "thing.to_world", "direction": [1, 0.3, 0]}
+THING_TURN = {"key": "thing.to_world", "rotate": [0.2, 1, 0.4]}
 LAMP_SIDE = {"key": "lamp.to_world", "direction": [1, 0.3, 0.2]}
 LAMP_TURN = {"key": "lamp.to_world", "rotate": [0.3, 0.2, 1]}
 CAMERA_X = {"key": "sensor.to_world", "direction": [1, 0, 0]}
@@ -639,6 +686,25 @@ CASES = [
     Case("lit_room_cube_turn", lit_room, TURN, 6e-3, 0.02, spp=1024),
     Case("lit_room_light", lit_room, {"key": "lamp.position", "direction": [1, 0.3, 0.2]}, 3e-3, 0.02, spp=1024),
     Case("lit_room_camera", lit_room, CAMERA_X, 3e-3, 0.02, spp=1024),
+    # Spheres, disks and cylinders.
+    Case("sphere_sun", sphere_over(sun), THING_SIDE, 6e-3, 0.02, spp=1024),
+    Case("sphere_soft", sphere_over(ceiling_light), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),
+    Case("sphere_camera", sphere_over(sun), CAMERA_X, 6e-3, 0.02, spp=1024),
+    Case("sphere_sky", sphere_over(constant), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),
+    Case("disk_sun_turn", disk_over(sun), THING_TURN, 6e-3, 0.02, spp=1024),
+    Case("disk_soft", disk_over(ceiling_light), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),
+    Case("cylinder_sun_turn", cylinder_over(sun), THING_TURN, 6e-3, 0.02, spp=1024),
+    Case("cylinder_soft", cylinder_over(ceiling_light), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),
+    Case("cylinder_camera", cylinder_over(ceiling_light), CAMERA_X, 6e-3, 0.02, spp=1024, runs=24),
+    Case(
+        "sphere_light",
+        sphere_light,
+        LAMP_SIDE,
+        2e-2,
+        0.02,
+        spp=1024,
+        runs=24,
+    ),
     # Geometry that moves at indirect bounces: only there, and in the frame as well.
     Case("out_of_frame", out_of_frame, SIDE, 0.12, 0.03, spp=1024, runs=100, integrator=prb_edge(3), noisy=True),
     Case("open_air", open_air, SIDE, 1e-2, 0.03, spp=1024, runs=96, integrator=prb_edge(3), noisy=True),

@@ -228,18 +228,6 @@ def moving(scene, key, **motion):
     return derivative_image(scene, integrator(), Motion(scene, key, **motion), spp=4)
 
 
-@pytest.mark.parametrize("shape", ["sphere", "disk", "cylinder"])
-def test_shapes_without_edges_must_stand_still(shape):
-    scene = cases.cube(
-        thing=lambda: {"type": shape, "id": "thing", "to_world": mi.ScalarTransform4f().translate([0, 2, 0])}
-    )()
-    with pytest.raises(RuntimeError, match=rf'shape "thing" \({shape.capitalize()}\) moves'):
-        moving(scene, "thing.to_world", direction=[1, 0, 0])
-    with pytest.raises(RuntimeError, match='camera moves past "thing"'):
-        moving(scene, "sensor.to_world", direction=[1, 0, 0])
-    assert np.isfinite(np.array(moving(scene, "cube.vertex_positions", direction=[1, 0, 0]))).all()
-
-
 def test_instances_must_stand_still():
     group = {"type": "shapegroup", "inner": cases.smooth_cube()}
     scene = cases.scene(
@@ -250,6 +238,8 @@ def test_instances_must_stand_still():
     )
     with pytest.raises(RuntimeError, match=r'shape "copy" \(Instance\) moves'):
         moving(scene, "copy.to_world", direction=[1, 0, 0])
+    with pytest.raises(RuntimeError, match='camera moves past "copy"'):
+        moving(scene, "sensor.to_world", direction=[1, 0, 0])
 
 
 def test_meshes_in_a_shape_group_must_stand_still():

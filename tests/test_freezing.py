@@ -78,8 +78,17 @@ VALUES = [
     ("room", "sensor.to_world"),
     ("room", "light.emitter.radiance.value"),
     ("cube", "cube.vertex_positions"),  # with normals, under a sky: no light has a surface
+    ("spot", "cube.vertex_positions"),
+    ("spot", "lamp.to_world"),
+    ("sphere", "thing.to_world"),
 ]
-SCENES = {"two_triangles": cases.two_triangles, "room": cases.room(), "cube": cases.cube()}
+SCENES = {
+    "two_triangles": cases.two_triangles,
+    "room": cases.room(),
+    "cube": cases.cube(),
+    "spot": cases.hard_shadow(lambda: {**cases.spot(), "intensity": 100.0}),
+    "sphere": cases.sphere_over(cases.sun, cases.ceiling_light),
+}
 
 
 @pytest.mark.parametrize(
@@ -201,7 +210,8 @@ def test_other_scenes_and_parameters():
 
 def test_all_that_is_read_is_known_to_frozen_functions():
     """Whoever adds an attribute names it in `DRJIT_STRUCT`, or here, if it is not read when sampling."""
-    scene, integrator = cases.room()(), mi.load_dict({"type": "prb_edge"})
+    scene = cases.room(ball=lambda: {"type": "sphere", "radius": 0.2})()
+    integrator = mi.load_dict({"type": "prb_edge"})
     dr.enable_grad(mi.traverse(scene)["cube.vertex_positions"])
     boundaries = integrator.find_boundaries(scene)
     shading, film = boundaries.shading, boundaries.film
@@ -211,7 +221,9 @@ def test_all_that_is_read_is_known_to_frozen_functions():
         (boundaries.shadows, set()),
         (boundaries.shadows.lights, set()),
         (shading, {"geometry"}),
-        (shading.tree, {"geometry", "node_offsets", "leaf_offsets"}),
+        (shading.silhouettes, {"geometry"}),
+        (shading.silhouettes.tree, {"geometry", "node_offsets", "leaf_offsets"}),
+        (shading.silhouettes.curves, set()),
     ):
         assert vars(part).keys() - unread == type(part).DRJIT_STRUCT.keys(), type(part).__name__
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_edge_tree import bumpy_sphere
 
-from rimlight.edge_sampling import EdgeTree, Geometry, Motion, ShadingBoundary, derivative_image, find_edges
+from rimlight.edge_sampling import Geometry, Motion, ShadingBoundary, Silhouettes, derivative_image, find_edges
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
 SIDE = [1, 0.3, 0.2]
@@ -217,9 +217,9 @@ def test_points_on_the_lines_of_edges():
     motion.apply(theta)
     dr.forward(theta, dr.ADFlag.ClearEdges)
     geometry = Geometry.of(scene)
-    tree = EdgeTree.by_motion(geometry, find_edges(geometry), None)
-    tree.refit(dr.detach(geometry.positions()))
-    shading = ShadingBoundary(scene, tree, geometry.moving())
+    silhouettes = Silhouettes(geometry, find_edges(geometry), None)
+    silhouettes.refit()
+    shading = ShadingBoundary(scene, silhouettes, None)
     shading.refit()
     x, z, count = [-0.5, 0.5, 0, 0.25, 0.7, -2, 0.5, 0.1], [0, 0, 0, 0, 0, 0, -0.25, -0.25], 256
     target = mi.Point3f(dr.repeat(mi.Float(x), count), 0, dr.repeat(mi.Float(z), count))
@@ -229,8 +229,8 @@ def test_points_on_the_lines_of_edges():
         assert dr.all(dr.norm(si.p - target) < 1e-6)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(x) * count)
-    positions = shading.geometry.positions()
-    L = shading.from_points(scene, positions, si, sampler, sampler.next_1d(), mi.Bool(True), share_emission=False)
+    placement = silhouettes.placement()
+    L = shading.from_points(scene, placement, si, sampler, sampler.next_1d(), mi.Bool(True), share_emission=False)
     derivative = np.array(dr.forward_to(L, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
     assert np.isfinite(derivative).all()
     seen = (derivative.reshape(3, len(x), count) != 0).any((0, 2))

@@ -13,11 +13,11 @@ from mitsuba.ad.integrators.common import ADIntegrator
 from rimlight._plan import Plan, PlannedTerm, names
 from rimlight.edge_sampling import (
     Edges,
-    EdgeTree,
     FilmBoundary,
     Geometry,
     ShadingBoundary,
     ShadowBoundary,
+    Silhouettes,
     find_edges,
     intersecting_meshes,
     jumping_textures,
@@ -90,8 +90,8 @@ class Boundaries:
     limits: tuple[str, ...] = ()
 
     @property
-    def tree(self) -> EdgeTree | None:
-        return next((b.tree for b in (self.shadows, self.shading) if b is not None), None)
+    def silhouettes(self) -> Silhouettes | None:
+        return next((b.silhouettes for b in (self.shadows, self.shading) if b is not None), None)
 
 
 class EdgeIntegrator(ADIntegrator):
@@ -261,7 +261,7 @@ class EdgeIntegrator(ADIntegrator):
             scattered = lambda ray, pi, sampler, active: self._onwards(scene, vertex, ray, pi, sampler, active)
         at_first = vertex.depth == 1
         with dr.resume_grad():
-            positions = shading.geometry.positions()
+            placement = shading.silhouettes.placement()
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, at_first)
             if self.depths.scatters(2):
                 # Vertices farther on follow their surfaces.
@@ -269,7 +269,7 @@ class EdgeIntegrator(ADIntegrator):
                 si = dr.select(at_first, si, vertex.pi.compute_surface_interaction(vertex.ray, follow, chosen))
         L = shading.from_points(
             scene,
-            positions,
+            placement,
             si,
             sampler,
             choice,
@@ -302,8 +302,8 @@ class EdgeIntegrator(ADIntegrator):
         terms = [lambda: self._interior(scene, sensor, sampler, weights, mode, sppc > 0)]
         if boundaries.film is not None and sppp > 0:
             terms.append(lambda: self._film_boundary(scene, sensor, seed, sppp, weights, boundaries.film))
-        if boundaries.tree is not None:
-            boundaries.tree.refit(dr.detach(boundaries.tree.geometry.positions()))
+        if boundaries.silhouettes is not None:
+            boundaries.silhouettes.refit()
         if boundaries.shadows is not None:
             terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, boundaries))
         if boundaries.shading is not None:
@@ -398,7 +398,7 @@ class EdgeIntegrator(ADIntegrator):
             self._line_samples(sensor, sppp),
             2 * path,
             film is not None and sppp,
-            f"{film.edges.count if film else 0} edges may move on the film",
+            f"{film.counts[0] + film.counts[2] if film else 0} edges may move on the film",
             '"sppp" is 0' if film is not None else "only lights move" if moves else "nothing moves",
         )
         add(
@@ -417,14 +417,14 @@ class EdgeIntegrator(ADIntegrator):
             "light that is scattered may be occluded" if segments > 2 else "glossy surfaces, or an environment",
             still if shadows is None else "direct light: found from the lights",
         )
-        meshes = zip(self._geometry.meshes, boundaries.moving, strict=False)
+        shapes = zip((*self._geometry.meshes, *self._geometry.analytic), boundaries.moving, strict=False)
         return Plan(
             integrator=self.name,
-            moving=names(m for m, moves in meshes if moves),
+            moving=names(s for s, moves in shapes if moves),
             camera_moves=boundaries.camera_moves,
             lights_move=boundaries.lights_move,
             edges=len(self._edges),
-            tree=boundaries.tree.leaf_offsets[-1] if boundaries.tree is not None else 0,
+            tree=boundaries.silhouettes.leaves if boundaries.silhouettes is not None else 0,
             terms=tuple(terms),
             limits=boundaries.limits,
         )
@@ -474,9 +474,8 @@ class EdgeIntegrator(ADIntegrator):
             limits = self._limits(scene, moving, camera_moves, sppi)
             for limit in limits:
                 self._warn_once(limit)
-            on_film = tuple(m or camera_moves for m in moving)
-            edges = self._edges.of_meshes(np.array(on_film, bool))
-            film = FilmBoundary(geometry, edges, geometry.faces(on_film)) if any(on_film) else None
+            on_film = np.array([m or camera_moves for m in moving], bool)
+            film = FilmBoundary(geometry, self._edges, on_film) if on_film.any() else None
             shadows, shading = self._light_boundaries(scene, moving, camera_moves or lights_move, sppi)
             self._boundaries[key] = Boundaries(film, shadows, shading, moving, camera_moves, lights_move, limits)
         if self._boundaries[key].shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
@@ -494,16 +493,22 @@ class EdgeIntegrator(ADIntegrator):
         self, scene, moving, everything, sppi
     ) -> tuple[ShadowBoundary | None, ShadingBoundary | None]:
         """What samples the edges of which lights and shading points know, as far as it is needed."""
-        if not sppi or not scene.emitters() or not len(self._edges) or not self.depths.scatters(1):
+        if not sppi or not scene.emitters() or not self.depths.scatters(1):
             return None, None
-        tree = EdgeTree.by_motion(self._geometry, self._edges, None if everything else moving)
-        shadows, shading = ShadowBoundary(scene, tree), ShadingBoundary(scene, tree, moving)
+        silhouettes = Silhouettes(self._geometry, self._edges, None if everything else moving)
+        if not len(silhouettes):
+            return None, None
+        shapes = zip((*self._geometry.meshes, *self._geometry.analytic), moving, strict=True)
+        moving_shapes = None if everything else [s for s, moves in shapes if moves]
+        shadows = ShadowBoundary(scene, silhouettes)
+        shading = ShadingBoundary(scene, silhouettes, moving_shapes)
         needed = self.depths.scatters(2) or shading.emission_at_first
         return shadows if len(shadows) else None, shading if needed else None
 
     def _lights_move(self, scene, moving) -> bool:
         """Do meshes that emit light move, or lights that are no shapes?"""
-        if any(m.is_emitter() and moves for m, moves in zip(self._geometry.meshes, moving, strict=True)):
+        shapes = (*self._geometry.meshes, *self._geometry.analytic)
+        if any(s.is_emitter() and moves for s, moves in zip(shapes, moving, strict=True)):
             return True
         others = [mi.traverse(e) for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
         return any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)

@@ -46,7 +46,7 @@ class Scattering:
         self.any_delta = any(f & mi.EmitterFlags.Delta for f in flags)
         self.any_hit_by_rays = any(not f & mi.EmitterFlags.Delta for f in flags)
         self.any_elsewhere = any(not f & (mi.EmitterFlags.Delta | mi.EmitterFlags.Surface) for f in flags)
-        self.moving = [mi.ShapePtr(s) for s in scene.shapes() if s.parameters_grad_enabled()]
+        self.moving = [(mi.ShapePtr(s), s.is_mesh()) for s in scene.shapes() if s.parameters_grad_enabled()]
         # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
@@ -151,19 +151,24 @@ class Scattering:
         return y, ω, dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
 
     def _area(self, pi, ray, active):
-        """Twice the area of the triangles hit, attached; 1 where they do not move."""
-        moves = mi.Bool(False)
-        for shape in self.moving:
-            moves |= pi.shape == shape
-        moves &= active
+        """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
+        on_mesh, on_other = mi.Bool(False), mi.Bool(False)
+        for shape, is_mesh in self.moving:
+            on_mesh |= is_mesh & (pi.shape == shape)
+            on_other |= (not is_mesh) & (pi.shape == shape)
+        on_mesh, on_other = on_mesh & active, on_other & active
+        # Of a triangle, twice its area.
         corners = []
         for u, v in ((0, 0), (1, 0), (0, 1)):
             corner = mi.PreliminaryIntersection3f(pi)
             corner.prim_uv = mi.Point2f(u, v)
             flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-            corners.append(corner.compute_surface_interaction(ray, flags, moves).p)
-        area = dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
-        return dr.select(moves, area, 1)
+            corners.append(corner.compute_surface_interaction(ray, flags, on_mesh).p)
+        area = dr.select(on_mesh, dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0])), 1)
+        if all(is_mesh for _, is_mesh in self.moving):
+            return area
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.dPdUV | mi.RayFlags.FollowShape, on_other)
+        return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
 
 
 def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:

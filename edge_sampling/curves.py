@@ -1,0 +1,141 @@
+"""Outlines of spheres, disks and cylinders: exact curves, not those of triangles.
+
+The rim of a disk, and the two of a cylinder, are fixed on their shape, like an open edge. The contour of a sphere, and
+the two lines along which a cylinder turns away, slide over the shape as the viewer moves. This does not matter: the
+motion of a contour across the line of sight is that of the *material* points that lie on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import drjit as dr
+import mitsuba as mi
+
+
+class CurveKind(IntEnum):
+    """CONTOUR : of a sphere. RIM : of a disk. BOTTOM, TOP : rims of a cylinder, at z = 0 and 1 of its own frame. LEFT,
+    RIGHT : its contour lines."""
+
+    CONTOUR = 0
+    RIM = 1
+    BOTTOM = 2
+    TOP = 3
+    LEFT = 4
+    RIGHT = 5
+
+
+#: Curves of the shapes with known outlines, by Mitsuba's names of their classes.
+CURVES = {
+    "Sphere": (CurveKind.CONTOUR,),
+    "Disk": (CurveKind.RIM,),
+    "Cylinder": (CurveKind.BOTTOM, CurveKind.TOP, CurveKind.LEFT, CurveKind.RIGHT),
+}
+
+#: Every curve is cut into so many pieces of equal parameter.
+PIECES = 16
+
+
+@dataclass
+class CurvePoint:
+    """A point of a curve, as it is seen from somewhere.
+
+    p : mi.Point3f, world space; attached to the motion of its shape.
+    tangent : mi.Vector3f, dp/dt along the piece. Detached.
+    inwards : mi.Vector3f, from p towards the shape. Detached.
+    valid : mi.Bool, is there one? A viewer inside of a sphere sees no contour.
+    """
+
+    p: mi.Point3f
+    tangent: mi.Vector3f
+    inwards: mi.Vector3f
+    valid: mi.Bool
+
+
+class Curves:
+    """The outlines of analytic shapes.
+
+    Parameters
+    ----------
+    shapes : of the classes in `CURVES`.
+    """
+
+    DRJIT_STRUCT = dict.fromkeys(("count", "_shapes", "_kind", "_shape"))  # for `dr.freeze`
+
+    def __init__(self, shapes: tuple[mi.Shape, ...]):
+        self._shapes = shapes
+        curves = [(kind, i) for i, s in enumerate(shapes) for kind in CURVES[s.class_name()]]
+        #: Number of curves.
+        self.count = len(curves)
+        # Not in NumPy's memory, for frozen functions.
+        self._kind, self._shape = (mi.UInt32([int(c[k]) for c in curves]) * dr.opaque(mi.UInt32, 1) for k in (0, 1))
+
+    def __len__(self) -> int:
+        """Number of pieces."""
+        return self.count * PIECES
+
+    def frames(self) -> mi.Float:
+        """`to_world` of all shapes, attached, and its inverse, detached: 24 numbers each, row by row."""
+        rows = []
+        for shape in self._shapes:
+            to_world = mi.traverse(shape)["to_world"]
+            for m in (to_world.matrix, dr.detach(to_world).inverse().matrix):
+                rows += [mi.Float(m[i, j]) for i in range(3) for j in range(4)]
+        return dr.concat(rows)
+
+    def centre(self, frames: mi.Float, curve: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
+        """Centre and radius of a ball around the shape of a curve. Detached."""
+        x, y, z, o = self._columns(dr.detach(frames), curve, 0)
+        is_cylinder = dr.gather(mi.UInt32, self._kind, curve) >= int(CurveKind.BOTTOM)
+        middle = mi.Point3f(o + dr.select(is_cylinder, 0.5 * z, 0))
+        return middle, dr.sqrt(dr.squared_norm(x) + dr.squared_norm(y) + dr.squared_norm(z))
+
+    def point(
+        self, frames: mi.Float, piece: mi.UInt32, t: mi.Float, eye: mi.Point3f, far: mi.Bool | bool = False
+    ) -> CurvePoint:
+        """The point t in [0, 1) of a piece, as seen from `eye`, world space; or at infinity, in the direction `eye`."""
+        curve = piece // PIECES
+        kind = dr.gather(mi.UInt32, self._kind, curve)
+        with dr.suspend_grad():
+            v = (piece % PIECES + t) / PIECES
+            x, y, z, o = self._columns(frames, curve, 12)
+            e = mi.Vector3f(dr.detach(eye))
+            e = x * e.x + y * e.y + z * e.z + dr.select(far, mi.Vector3f(0), o)
+
+            sin, cos = dr.sincos(dr.two_pi * v)
+            circle = mi.Vector3f(cos, sin, dr.select(kind == int(CurveKind.TOP), mi.Float(1), 0))
+            local, tangent = circle, mi.Vector3f(-sin, cos, 0) * dr.two_pi
+            rim = kind == int(CurveKind.RIM)
+            inwards = dr.select(rim, -circle, mi.Vector3f(0, 0, 1 - 2 * circle.z))
+            valid = mi.Bool(True)
+
+            contour = kind == int(CurveKind.CONTOUR)
+            d2 = dr.squared_norm(e)
+            s, u = mi.coordinate_system(dr.normalize(e))
+            radius = dr.select(far, 1, dr.safe_sqrt(1 - dr.rcp(d2)))
+            on_sphere = dr.select(far, mi.Vector3f(0), e / d2) + radius * (s * cos + u * sin)
+            local = dr.select(contour, on_sphere, local)
+            tangent = dr.select(contour, (u * cos - s * sin) * (radius * dr.two_pi), tangent)
+            inwards = dr.select(contour, -local, inwards)
+            valid &= ~contour | far | (d2 > 1)
+
+            side = kind >= int(CurveKind.LEFT)
+            r2 = dr.square(e.x) + dr.square(e.y)
+            turn = dr.select(far, 0.5 * dr.pi, dr.safe_acos(dr.rsqrt(r2)))
+            sin, cos = dr.sincos(dr.atan2(e.y, e.x) + dr.select(kind == int(CurveKind.LEFT), turn, -turn))
+            local = dr.select(side, mi.Vector3f(cos, sin, v), local)
+            tangent = dr.select(side, mi.Vector3f(0, 0, 1), tangent)
+            inwards = dr.select(side, mi.Vector3f(-cos, -sin, 0), inwards)
+            valid &= ~side | ((r2 > 0) & far) | (r2 > 1)
+        x, y, z, o = self._columns(frames, curve, 0)
+        p = mi.Point3f(x * local.x + y * local.y + z * local.z + o)
+        with dr.suspend_grad():
+            x, y, z = dr.detach(x), dr.detach(y), dr.detach(z)
+            to_world = lambda w: x * w.x + y * w.y + z * w.z
+            return CurvePoint(p, to_world(tangent) / PIECES, to_world(inwards), valid)
+
+    def _columns(self, frames: mi.Float, curve: mi.UInt32, start: int) -> list[mi.Vector3f]:
+        """Images of the axes, and of the origin."""
+        first = dr.gather(mi.UInt32, self._shape, curve) * 24 + start
+        return [mi.Vector3f(*(dr.gather(mi.Float, frames, first + 4 * i + j) for i in range(3))) for j in range(4)]

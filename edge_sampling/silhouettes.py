@@ -1,0 +1,190 @@
+"""All that can be an outline in a scene: edges of meshes, found by a tree, and the curves of analytic shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .curves import PIECES, Curves
+from .edge_importance import EdgeSample, View, sample_edge
+from .edge_tree import EdgeTree
+from .edges import Edges
+from .meshes import Geometry
+
+#: Part of the samples that are for curves, where there are edges, too.
+CURVE_PART = 0.5
+
+
+@dataclass
+class Placement:
+    """Where shapes are, attached to their motion.
+
+    positions : mi.Float, (3 V,), vertices of all meshes, world space.
+    frames : mi.Float, frames of the analytic shapes, see `Curves.frames`; None: there are none.
+    """
+
+    positions: mi.Float
+    frames: mi.Float | None
+
+
+@dataclass
+class OutlinePoint:
+    """A point of an edge or a curve.
+
+    p : mi.Point3f, world space; attached to its placement.
+    tangent : mi.Vector3f, dp/dt, where t is the parameter that was sampled. Detached.
+    inwards : two vectors from p towards the faces on the two sides of an edge. Detached.
+    """
+
+    p: mi.Point3f
+    tangent: mi.Vector3f
+    inwards: tuple[mi.Vector3f, mi.Vector3f]
+
+    def outward(self, across: mi.Vector3f) -> mi.Float:
+        """The side of a silhouette on which its faces are not: the sign of `across`, (N,); 0 where they are on both.
+
+        across : a direction across the edge and the line of sight.
+        """
+        sides = [dr.sign(dr.dot(v, across)) for v in self.inwards]
+        return dr.select(sides[0] == sides[1], -sides[0], 0)
+
+
+class Silhouettes:
+    """Chooses points on the edges and curves of a scene, as a viewer sees them.
+
+    Parameters
+    ----------
+    geometry : the shapes.
+    edges : their edges, on the host.
+    moving : see `Geometry.moving`. None: take all as moving.
+
+    Moving edges are a group of their own, so that viewers that stand still need not look at the others.
+    """
+
+    DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "count", "groups", "centre"))  # for `dr.freeze`
+
+    def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
+        self.geometry = geometry
+        self.count = len(edges)
+        moves = np.ones(len(edges), bool)
+        if moving is not None:
+            moves = np.array(moving, bool)[edges.mesh].any(axis=1)
+        groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
+        #: Number of groups of edges.
+        self.groups = len(groups)
+        self.tree = EdgeTree(geometry, edges, groups) if groups else None
+        self.curves = Curves(geometry.analytic) if geometry.analytic else None
+        self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
+
+    def __len__(self) -> int:
+        """Number of edges, and of pieces of curves."""
+        return self.count + (len(self.curves) if self.curves is not None else 0)
+
+    @property
+    def leaves(self) -> int:
+        """Number of leaves of the trees over the edges."""
+        return self.tree.leaf_offsets[-1] if self.tree is not None else 0
+
+    def refit(self) -> None:
+        """Follow the vertices. To be called before sampling."""
+        if self.tree is not None:
+            self.tree.refit(dr.detach(self.geometry.positions()))
+
+    def placement(self) -> Placement:
+        """Where everything is. Attached, if gradients are not suspended."""
+        return Placement(self.geometry.positions(), self.curves.frames() if self.curves is not None else None)
+
+    def sample(
+        self,
+        placement: Placement,
+        view: View,
+        sampler: mi.Sampler,
+        use: list[mi.Float | float],
+        *,
+        choice: mi.Float,
+        from_light: bool,
+        active: mi.Bool,
+    ) -> EdgeSample:
+        """Choose an edge or a curve, and a point on it: `sample_edge`, which tells the arguments. Pieces of curves are
+        numbered after the edges."""
+        if self.curves is None:
+            return sample_edge(self.tree, view, sampler, use, choice=choice, from_light=from_light, active=active)
+        part = CURVE_PART if self.tree is not None else 1.0
+        on_curve = choice < part
+        curve = self._sample_curve(placement, view, sampler, dr.minimum(choice / part, dr.one_minus_epsilon(mi.Float)))
+        curve.density *= part
+        if self.tree is None:
+            return curve
+        choice = dr.clip((choice - part) / (1 - part), 0, dr.one_minus_epsilon(mi.Float))
+        edge = sample_edge(
+            self.tree, view, sampler, use, choice=choice, from_light=from_light, active=active & ~on_curve
+        )
+        edge.density *= 1 - part
+        return dr.select(on_curve, curve, edge)
+
+    def _sample_curve(self, placement, view, sampler, choice) -> EdgeSample:
+        """Curves in proportion to how large their shapes appear, and uniformly along them."""
+        eye = dr.select(self._far(view), mi.Point3f(view.p), mi.Point3f(view.p + self.centre))
+
+        def look(i, total, kept, weight, choice):
+            centre, radius = self.curves.centre(placement.frames, i)
+            d = dr.select(self._far(view), -mi.Vector3f(eye), centre - eye)
+            distance = dr.norm(d)
+            w = dr.select(self._far(view), radius, radius / dr.maximum(distance, radius))
+            beyond = (dr.dot(view.n, d) < -radius) & ~self._far(view)
+            if view.cone is not None:
+                axis, cos = view.cone.axis, view.cone.cos
+                # Outside, if the angle to the cone is more than that of the ball.
+                along, off = dr.dot(axis, d), dr.norm(dr.cross(axis, d))
+                beyond |= ~view.cone.everything & (off * cos - along * view.cone.sin > radius)
+            w = dr.select(beyond, 0, w)
+            total += w
+            p = dr.select(total > 0, w / total, 0)
+            taken = choice < p
+            choice = dr.select(taken, choice / p, (choice - p) / (1 - p))
+            return i + 1, total, dr.select(taken, i, kept), dr.select(taken, w, weight), choice
+
+        width = dr.width(choice)
+        state = (dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width), dr.zeros(mi.UInt32, width))
+        _, total, curve, weight, choice = dr.while_loop(
+            (*state, dr.zeros(mi.Float, width), choice), lambda i, *_: i < self.curves.count, look, label="curves"
+        )
+        x = dr.clip(choice, 0, dr.one_minus_epsilon(mi.Float)) * PIECES
+        piece = dr.minimum(mi.UInt32(x), PIECES - 1)
+        t = sampler.next_1d()
+        density = dr.select(total > 0, weight / (total * PIECES), 0)
+        return EdgeSample(self.count + curve * PIECES + piece, t, density)
+
+    @staticmethod
+    def _far(view: View) -> mi.Bool:
+        return mi.Bool(False) if view.far is None else view.far
+
+    def point(
+        self, placement: Placement, sample: EdgeSample, eye: mi.Point3f, far: mi.Bool | bool = False
+    ) -> OutlinePoint:
+        """The point that was sampled, as seen from `eye`, world space; or at infinity, in the direction `eye`."""
+        if self.tree is not None:
+            on_edge = sample.edge < self.count
+            index = dr.select(on_edge, sample.edge, 0) if self.curves is not None else sample.edge
+            edges = self.tree.device_edges
+            a, b = edges.end_points(placement.positions, index)
+            p = dr.lerp(a, b, sample.t)
+            with dr.suspend_grad():
+                opposite = edges.opposite(placement.positions, index)
+                point = OutlinePoint(p, dr.detach(b - a), tuple(dr.detach(o - p) for o in opposite))
+            if self.curves is None:
+                return point
+        piece = sample.edge - self.count
+        if self.tree is not None:
+            piece = dr.select(on_edge, 0, piece)
+        c = self.curves.point(placement.frames, piece, sample.t, eye, far)
+        # Where there is none, both sides seem to have a face.
+        on_curve = OutlinePoint(c.p, c.tangent, (c.inwards, dr.select(c.valid, c.inwards, -c.inwards)))
+        if self.tree is None:
+            return on_curve
+        choose = lambda x, y: dr.select(on_edge, x, y)
+        inwards = tuple(choose(x, y) for x, y in zip(point.inwards, on_curve.inwards, strict=True))
+        return OutlinePoint(choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent), inwards)
