@@ -16,7 +16,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 
-TYPES = {"int": "integer", "bool": "boolean", "float": "float", "string": "string", "spectrum": "spectrum"}
+TYPES = {"int": "integer", "bool": "boolean"} | {k: k for k in ("float", "string", "spectrum", "texture")}
 FLAGS = {"exposed": "P", "differentiable": "∂", "discontinuous": "D"}
 
 
