@@ -16,8 +16,17 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
 
-TYPES = {"int": "integer", "bool": "boolean"} | {k: k for k in ("float", "string", "spectrum", "texture")}
+from rimlight._registration import plugin_modules
+
+KINDS = ("float", "string", "spectrum", "texture", "point", "vector", "transform")
+TYPES = {"int": "integer", "bool": "boolean"} | {k: k for k in KINDS}
 FLAGS = {"exposed": "P", "differentiable": "∂", "discontinuous": "D"}
+
+
+def plugin_class(name: str) -> type:
+    """The class whose manual page is that of the plugin. Not every plugin can be loaded without parameters."""
+    (module,) = (m for k, m in plugin_modules(mi.variant()).items() if k.rpartition(".")[2] == name)
+    return next(c for c in vars(module).values() if inspect.isclass(c) and f":monosp:`{name}`" in (c.__doc__ or ""))
 
 
 class PluginPage(SphinxDirective):
@@ -27,10 +36,10 @@ class PluginPage(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         (name,) = self.arguments
-        plugin = mi.load_dict({"type": name})
-        source = inspect.getsourcefile(type(plugin)) or name
+        plugin = plugin_class(name)
+        source = inspect.getsourcefile(plugin) or name
         self.env.note_dependency(source)
-        text = StringList(inspect.getdoc(type(plugin)).splitlines(), source=source)
+        text = StringList(inspect.getdoc(plugin).splitlines(), source=source)
         container = nodes.Element(document=self.state.document)
         nested_parse_with_titles(self.state, text, container)
         return container.children

@@ -45,6 +45,8 @@ class Scattering:
         self.any = bool(flags)
         self.any_delta = any(f & mi.EmitterFlags.Delta for f in flags)
         self.any_hit_by_rays = any(not f & mi.EmitterFlags.Delta for f in flags)
+        #: Emitters of several lights, see `rimlight.edge_sampling.lights.Lights`.
+        self.several = [e for e in scene.emitters() if hasattr(e, "light_count") and e.sampling_weight() > 0]
         self.any_elsewhere = any(not f & (mi.EmitterFlags.Delta | mi.EmitterFlags.Surface) for f in flags)
         self.moving = [(mi.ShapePtr(s), s.is_mesh()) for s in scene.shapes() if s.parameters_grad_enabled()]
         # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
@@ -73,7 +75,7 @@ class Scattering:
             active &= visible
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(context, si, si.to_local(direction), active)
-            mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(pdf)))
+            mis = dr.select(ds.delta | self._found_by_light_samples(ds), 1, mis_weight(ds.pdf, dr.detach(pdf)))
             return dr.select(active, f * weight * mis, 0)
 
     def _attach_emitter(self, si, ds, weight, sample, active):
@@ -94,10 +96,12 @@ class Scattering:
             if self.any_elsewhere:
                 elsewhere = scene.eval_emitter_direction(si, ds, active & ~on_surface & ~ds.delta) / ds.pdf
                 attached = dr.select(on_surface, attached, elsewhere)
-            if self.any_delta:
-                moved, at_delta = scene.sample_emitter_direction(si, sample, False, active & ds.delta)
-                direction = dr.select(ds.delta, moved.d, direction)
-                attached = dr.select(ds.delta, at_delta, attached)
+            if self.any_delta or self.several:
+                # A point of a disc follows it.
+                follows = ds.delta | self._of_several(ds.emitter)
+                moved, at_moved = scene.sample_emitter_direction(si, sample, False, active & follows)
+                direction = dr.select(follows, moved.d, direction)
+                attached = dr.select(follows, at_moved, attached)
             return direction, dr.replace_grad(weight, attached), visible
 
     def sample_bsdf(self, si, bsdf, sampler, active):
@@ -133,8 +137,35 @@ class Scattering:
         pdf = scene.pdf_emitter_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
         mis = dr.select(mirrored, 1, mis_weight(bs.pdf, pdf))
         with dr.resume_grad(when=self.attached):
-            Le = dr.select(active, weight * emitter.eval(y, active) * mis, 0)
+            Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
         return Le, Next(ray, pi, weight, bs.eta)
+
+    # ---------------------- Emitters of several lights ----------------------
+
+    # Discs that overlap move apart: a direction that was sampled from the BSDF cannot follow both. So discs are left to
+    # light samples, wherever these are possible, in values and derivatives alike.
+
+    def _of_several(self, emitter: mi.EmitterPtr) -> mi.Bool:
+        found = mi.Bool(False)
+        for several in self.several:
+            found |= emitter == mi.EmitterPtr(several)
+        return found
+
+    def _found_by_light_samples(self, ds: mi.DirectionSample3f) -> mi.Bool:
+        """Is a light sample the only way to its light?"""
+        found = mi.Bool(False)
+        for several in self.several:
+            found |= several.of_light(ds)
+        return found
+
+    def _emission(self, emitter, y, mirrored, active) -> mi.Spectrum:
+        """What the BSDF sample sees at y."""
+        without = active & self._of_several(emitter) & ~mirrored
+        L = emitter.eval(y, active & ~without)
+        for several in self.several:
+            mine = without & (emitter == mi.EmitterPtr(several))
+            L = dr.select(mine, several.eval_background(y, mine), L)
+        return L
 
     def _connect(self, si, pi, ray, active):
         """The material point y that `pi` stands for, the direction ω from `si` to it, and |cos θ_y| dA / r² relative
