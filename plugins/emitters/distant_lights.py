@@ -166,7 +166,12 @@ class DistantLights(mi.Emitter):
                 borders *= 1 - dr.clip(share, EVEN, 1 - EVEN)
             #: Light k is chosen by random numbers in [borders[k], borders[k + 1]); the background by those beyond.
             self._borders = borders
-        dr.make_opaque(self.directions, self.irradiance, self.angular_radius, self._borders)
+            #: Axis and squared chord of each disc: d lies in it if |d − axis|² ≤ chord². Negative for radius 0.
+            k = dr.arange(mi.UInt32, K)
+            chord2 = dr.square(2 * dr.sin(self._half_angle(k, True)))
+            axis, chord2 = dr.detach(self._axis(k, True)), dr.detach(dr.select(chord2 > 0, chord2, -1))
+            self._caps = dr.ravel(mi.Vector4f(*axis, chord2))
+        dr.make_opaque(self.directions, self.irradiance, self.angular_radius, self._borders, self._caps)
 
     def to_string(self) -> str:
         sky = "" if self.background is None else f", background={self.background}"
@@ -302,11 +307,10 @@ class DistantLights(mi.Emitter):
 
     def _density(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         with dr.suspend_grad():
-            d = dr.detach(d)
 
-            def of(k: mi.UInt32, half: mi.Float) -> mi.Float:
+            def of(k: mi.UInt32, chord2: mi.Float) -> mi.Float:
                 begin, end = self._interval(k)
-                return (end - begin) * dr.inv_four_pi / dr.square(dr.sin(half))  # solid angle 4π sin² (a / 2)
+                return (end - begin) * dr.inv_pi / chord2  # solid angle 4π sin² (a / 2)
 
             density = self._over_discs(mi.Float(0), of, d, active)
             if self.background is not None:
@@ -314,20 +318,20 @@ class DistantLights(mi.Emitter):
             return density
 
     def _radiance(self, d: mi.Vector3f, wavelengths: Any, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        of = lambda k, half: self._irradiance(k, active) * (dr.inv_pi / dr.square(dr.sin(2 * half)))
+        sin2 = lambda k: dr.square(dr.sin(2 * self._half_angle(k, active)))
+        of = lambda k, chord2: self._irradiance(k, active) * (dr.inv_pi / sin2(k))
         discs = self._over_discs(mi.Color3f(0), of, d, active)
         return self._spectrum(discs, wavelengths) + self._sky(wavelengths, active)
 
     def _over_discs(self, zero: Any, of: Callable[[mi.UInt32, mi.Float], Any], d: mi.Vector3f, active: mi.Bool) -> Any:
-        """Sum of `of(k, half of the angular radius)` over the discs in which `d` lies, in the type of `zero`."""
+        """Sum of `of(k, chord²)` over the discs in which `d` lies, in the type of `zero`."""
         if not self._discs:
             return zero
+        d = dr.detach(d)
 
         def term(k):
-            half = self._half_angle(k, active)
-            s = dr.sin(dr.detach(half))
-            inside = (s > 0) & (dr.squared_norm(dr.detach(d - self._axis(k, active))) <= 4 * dr.square(s))
-            return dr.select(inside, of(k, half), 0)
+            x, y, z, chord2 = dr.gather(mi.Vector4f, self._caps, k, active)
+            return dr.select(dr.squared_norm(d - mi.Vector3f(x, y, z)) <= chord2, of(k, chord2), 0)
 
         if self.light_count == 1:
             return term(mi.UInt32(0))
