@@ -6,7 +6,7 @@ from .edges import EdgeKind, Edges, find_edges
 from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
 from .intersections import intersecting_meshes
-from .lights import Lights
+from .lights import Lights, has_hard_beam
 from .meshes import Geometry, jumping_textures
 from .motion import Motion, derivative_image
 from .projection import Projection
@@ -37,6 +37,7 @@ __all__ = [
     "derivative_image",
     "find_edges",
     "finite_differences",
+    "has_hard_beam",
     "intersecting_meshes",
     "jumping_textures",
     "mean_and_error",

@@ -50,6 +50,7 @@ class Motion:
         self.key = key
         self.is_positions = key.endswith("vertex_positions")
         self.is_transform = key.endswith("to_world")
+        self.is_tensor = dr.is_tensor_v(value)
         if not (self.is_positions or self.is_transform or dr.is_float_v(value)):
             raise ValueError(f'"{key}" is of type {type(value).__name__}, it cannot be varied continuously')
         if rotate is not None and not (self.is_positions or self.is_transform):
@@ -59,7 +60,7 @@ class Motion:
 
         self.initial = type(value)(dr.detach(value))
         geometric = self.is_positions or self.is_transform
-        size = 3 if geometric else dr.size_v(value) * dr.width(value)
+        size = 3 if geometric else dr.width(value.array) if self.is_tensor else dr.size_v(value) * dr.width(value)
         self.direction = (
             None if direction is None else _numbers(key, "direction", direction, {size} if geometric else {1, size})
         )
@@ -104,13 +105,13 @@ class Motion:
         elif self.is_transform:
             value = self._transform(theta) @ self.initial
         else:
-            direction = mi.Float(self.direction)
-            value = (
-                dr.ravel(self.initial) + theta * direction
-                if dr.size_v(self.initial) > 1
-                else self.initial + theta * direction
-            )
-            value = dr.unravel(type(self.initial), value) if dr.size_v(self.initial) > 1 else type(self.initial)(value)
+            kind, step = type(self.initial), theta * mi.Float(self.direction)
+            if self.is_tensor:
+                value = kind(self.initial.array + step, self.initial.shape)
+            elif dr.size_v(self.initial) > 1:
+                value = dr.unravel(kind, dr.ravel(self.initial) + step)
+            else:
+                value = kind(self.initial + step)
         self.params[self.key] = value
         self.params.update()
 

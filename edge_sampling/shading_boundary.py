@@ -53,7 +53,7 @@ class ShadingBoundary:
         edges matter at all points.
     """
 
-    _NUMBERS = ("transmits", "glossy", "emission", "emission_at_first")
+    _NUMBERS = ("transmits", "glossy", "emission", "emission_at_first", "several")
     DRJIT_STRUCT = dict.fromkeys(("silhouettes", "boxes", "moving_shapes", "lights", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None):
@@ -69,10 +69,16 @@ class ShadingBoundary:
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
         self.glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
-        elsewhere = any(not emitters[i].flags() & mi.EmitterFlags.Surface for i in lights)
-        #: Is emitted light sought at points that the camera sees, too? For diffuse surfaces and lights on surfaces,
-        #: `ShadowBoundary` is enough.
-        self.emission_at_first = self.emission and (self.glossy or elsewhere)
+        #: Emitters of several lights (see `Lights`): at the first vertex, only their background counts.
+        self.several = [e for e in emitters if hasattr(e, "light_count")]
+        #: Is emitted light sought at points that the camera sees, too? For diffuse surfaces `ShadowBoundary` is enough,
+        #: except for the light of environments.
+        self.emission_at_first = any(self._counts_at_first(emitters[i]) for i in lights)
+
+    def _counts_at_first(self, emitter: mi.Emitter) -> bool:
+        if emitter.flags() & mi.EmitterFlags.Surface:
+            return self.glossy
+        return not hasattr(emitter, "light_count") or emitter.background is not None
 
     def refit(self) -> None:
         """Follow the vertices. To be called before sampling, after the tree is refitted."""
@@ -229,6 +235,9 @@ class ShadingBoundary:
             emitter = y.emitter(scene, active)
             lit = active & emission & (emitter == light)
             L = emitter.eval(y, lit)
+            for several in self.several:
+                mine = lit & share_emission & (emitter == mi.EmitterPtr(several))
+                L = dr.select(mine, several.eval_background(y, mine), L)
             shared = lit & share_emission & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
             light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared)
             L *= dr.select(shared, power_heuristic(pdf, light_pdf), 1)

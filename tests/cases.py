@@ -478,6 +478,23 @@ def over_floor(thing: dict, lamps: tuple[Callable[[], dict], ...]) -> mi.Scene:
     )
 
 
+def projector() -> dict:
+    """It throws a smooth image with a black border."""
+    x = np.linspace(-1, 1, 16)
+    window = np.cos(0.5 * np.pi * x)
+    window[[0, -1]] = 0
+    image = (window[:, None] * window)[..., None] * (1 + 0.5 * np.sin(5 * x[:, None, None] + np.arange(3)))
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(np.float32(image)), "raw": True}
+    return {"type": "projector", "to_world": spot()["to_world"], "irradiance": bitmap, "fov": 40.0, "scale": 10.0}
+
+
+def distant(angular_radius: float = 0) -> Callable[[], dict]:
+    """Three distant lights."""
+    directions = "-0.5 1 -0.3, 0.5 1 0.1, 0.1 0.8 -0.9"
+    lights = {"type": "distant_lights", "directions": directions, "irradiance": "1 0.9 0.8, 0.4 0.5 0.6, 0.3 0.3 0.3"}
+    return lambda: {**lights, "angular_radius": angular_radius}
+
+
 def ceiling_light() -> dict:
     """Of half-side 0.3."""
     return horizontal((-0.5, 3, -0.5), 0.3, "lamp", down=True, bsdf=diffuse(0.0), emitter=light(40, 38, 36))
@@ -516,6 +533,7 @@ def lit_room() -> mi.Scene:
 DEPTH = {"key": "cube.vertex_positions", "direction": [0, 0, 1]}
 SIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.2, 1, 0]}
+DIRECTIONS = {"key": "lamp.directions", "direction": [0.3, 0, 1, 1, 0, 0, 0, 0.5, 0.5]}
 THING_SIDE = {"key": "thing.to_world", "direction": [1, 0.3, 0]}
 THING_TURN = {"key": "thing.to_world", "rotate": [0.2, 1, 0.4]}
 LAMP_SIDE = {"key": "lamp.to_world", "direction": [1, 0.3, 0.2]}
@@ -686,6 +704,15 @@ CASES = [
     Case("lit_room_cube_turn", lit_room, TURN, 6e-3, 0.02, spp=1024),
     Case("lit_room_light", lit_room, {"key": "lamp.position", "direction": [1, 0.3, 0.2]}, 3e-3, 0.02, spp=1024),
     Case("lit_room_camera", lit_room, CAMERA_X, 3e-3, 0.02, spp=1024),
+    Case("projector_cube", hard_shadow(projector), SIDE, 6e-3, 0.02, spp=1024),
+    Case("projector_turns", hard_shadow(projector), LAMP_TURN, 6e-3, 0.02, spp=1024),
+    Case("distant_cube", hard_shadow(distant()), SIDE, 6e-3, 0.02, spp=1024),
+    Case("distant_cube_turn", hard_shadow(distant()), TURN, 6e-3, 0.02, spp=1024),
+    Case("distant_lights", hard_shadow(distant()), DIRECTIONS, 6e-3, 0.02, spp=1024),
+    Case("distant_camera", hard_shadow(distant()), CAMERA_X, 6e-3, 0.02, spp=1024),
+    Case("discs_cube", hard_shadow(distant(5)), SIDE, 6e-3, 0.02, spp=1024, runs=24),
+    Case("discs_lights", hard_shadow(distant(5)), DIRECTIONS, 1e-2, 0.02, spp=1024, runs=24),
+    Case("discs_radius", hard_shadow(distant(5)), {"key": "lamp.angular_radius", "direction": [1]}, 0.2, 0.02),
     # Spheres, disks and cylinders.
     Case("sphere_sun", sphere_over(sun), THING_SIDE, 6e-3, 0.02, spp=1024),
     Case("sphere_soft", sphere_over(ceiling_light), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),

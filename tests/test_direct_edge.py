@@ -309,6 +309,20 @@ def test_limits_are_warned_about_once():
     assert "perfect mirrors" not in quiet
 
 
+@pytest.mark.parametrize(
+    ("lamp", "hard"),
+    [
+        ({"type": "spot"}, False),
+        ({"type": "spot", "cutoff_angle": 20.0, "beam_width": 20.0}, True),
+        ({"type": "projector", "irradiance": {"type": "rgb", "value": 1.0}}, True),
+    ],
+)
+def test_borders_of_beams_are_warned_about(lamp, hard):
+    scene = cases.cube(lamp=lambda: lamp)()
+    text = warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
+    assert ('the border of the beams of "lamp"' in text) == hard
+
+
 def test_a_scene_that_does_not_move_is_a_mistake():
     scene = cases.cube()()
     with pytest.raises(RuntimeError, match="none of the parameters carries a gradient"):

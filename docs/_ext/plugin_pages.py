@@ -18,8 +18,6 @@ from sphinx.util.nodes import nested_parse_with_titles
 
 from rimlight._registration import plugin_modules
 
-from rimlight._registration import plugin_modules
-
 KINDS = ("float", "string", "spectrum", "texture", "point", "vector", "transform")
 TYPES = {"int": "integer", "bool": "boolean"} | {k: k for k in KINDS}
 FLAGS = {"exposed": "P", "differentiable": "∂", "discontinuous": "D"}

@@ -19,6 +19,7 @@ from rimlight.edge_sampling import (
     ShadowBoundary,
     Silhouettes,
     find_edges,
+    has_hard_beam,
     intersecting_meshes,
     jumping_textures,
     stratified,
@@ -517,9 +518,18 @@ class EdgeIntegrator(ADIntegrator):
         """What the derivative will lack."""
         limits = []
         geometry = self._geometry
-        delta = any(e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
+        delta = any(
+            e.flags() & mi.EmitterFlags.Delta or (hasattr(e, "light_count") and dr.any(e.angular_radius == 0))
+            for e in scene.emitters()
+        )
         if sppi > 0 and delta and self.depths.scatters(2):
             limits.append(HARD_SHADOWS)
+        beams = names(e for e in scene.emitters() if has_hard_beam(e))
+        if sppi > 0 and beams:
+            limits.append(
+                f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below "
+                "its cutoff_angle, and a projector an image with a black border."
+            )
         if sppi > 0 and any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes()):
             limits.append(
                 "the derivative lacks the motion of what perfect mirrors and glass show; "
