@@ -17,7 +17,9 @@ class DeviceEdges:
     """Topology of `Edges` as Dr.Jit arrays. Vertex positions are given with each call, since they change."""
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
-    DRJIT_STRUCT = dict.fromkeys(("count", "_ends", "_opposite", "_kind", "_kinds", "_any_split", "_two_faces"))
+    DRJIT_STRUCT = dict.fromkeys(
+        ("count", "_ends", "_opposite", "_kind", "_kinds", "any_smooth", "_any_split", "_two_faces")
+    )
 
     def __init__(self, edges: Edges):
         index = lambda a: mi.UInt32(np.ascontiguousarray(a))
@@ -26,6 +28,8 @@ class DeviceEdges:
         self._opposite = [index(edges.opposite[:, side]) for side in (0, 1)]
         self._kind = index(edges.kind)
         self._kinds = frozenset(edges.kind)
+        #: Are there edges with interpolated normals?
+        self.any_smooth = not self._kinds.isdisjoint({EdgeKind.SMOOTH, EdgeKind.SPLIT})
         self._two_faces = mi.Bool(edges.count == 2)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
@@ -78,6 +82,20 @@ class DeviceEdges:
                 passed[k] |= (dr.minimum(*turns[:2]) > 0) & (turns[2] > 0)
                 passed[k] |= (dr.maximum(*turns[:2]) < 0) & (turns[2] < 0)
         return fold & ~(passed[0] & passed[1])
+
+    def is_silhouette_of_any(self, positions: mi.Float, edge: mi.UInt32, places: mi.Vector4f) -> mi.Bool:
+        """Is the edge a silhouette as seen from one of the `places`, see `Lights.places`? Detached."""
+        a, _ = self.end_points(positions, edge)
+        normals = self.normals(positions, edge)
+
+        def look(k, found):
+            place = dr.gather(mi.Vector4f, packed, k)
+            towards = mi.Vector3f(place.x, place.y, place.z) - place.w * a
+            return k + 1, found | (dr.dot(normals[0], towards) * dr.dot(normals[1], towards) > 0)
+
+        packed, count, width = dr.ravel(places), dr.width(places), dr.width(edge)
+        state = (dr.zeros(mi.UInt32, width), dr.full(mi.Bool, False, width))
+        return dr.while_loop(state, lambda k, found: ~found & (k < count), look, label="silhouettes of lights")[1]
 
     def normals_differ(self, normals: mi.Float, edge: mi.UInt32) -> mi.Float:
         """By how much the vertex normals of the two sides differ at most."""

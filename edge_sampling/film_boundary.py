@@ -23,6 +23,7 @@ import numpy as np
 from .curves import Curves
 from .device_edges import DeviceEdges
 from .edges import Edges
+from .lights import Lights
 from .meshes import Geometry
 from .projection import FilmPoint, Projection, frame, inside_frame, tangent
 
@@ -55,12 +56,13 @@ class FilmBoundary:
     geometry : the shapes.
     edges : of their meshes, on the host.
     moving : see `Geometry.moving`; which of them can move over the film.
+    lights : of the scene.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "curves", "counts"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "curves", "counts", "lights"))  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray):
-        self.geometry = geometry
+    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights):
+        self.geometry, self.lights = geometry, lights
         edges, faces = edges.of_meshes(moving), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays.)
         self.edges = DeviceEdges(edges) if len(edges) else None
@@ -73,10 +75,11 @@ class FilmBoundary:
 
     def sample(
         self,
+        scene: mi.Scene,
         sensor: mi.Sensor,
         sampler: mi.Sampler,
         count: int,
-        radiance: Callable[[mi.RayDifferential3f, mi.Sampler, mi.Bool], tuple[mi.Spectrum, mi.Float]],
+        radiance: Callable[[mi.RayDifferential3f, mi.Sampler, mi.Bool, mi.Bool], tuple[mi.Spectrum, mi.Float]],
     ) -> BoundarySamples:
         """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
 
@@ -84,7 +87,8 @@ class FilmBoundary:
         stratified number.
 
         sampler : seeded for `count` lanes.
-        radiance : maps (rays, sampler, active) to (L, alpha), detached. Called for both sides of the edge with equal
+        radiance : maps (rays, sampler, active, outline) to (L, alpha), detached; `outline`: does the ray pass a
+            silhouette, or something else that is one from everywhere? Called for both sides of the edge with equal
             random numbers, so that an edge that is hidden, or across which nothing jumps, contributes next to nothing
             rather than noise.
 
@@ -97,7 +101,12 @@ class FilmBoundary:
             frames = self.curves.frames() if self.curves is not None else None
         with dr.suspend_grad():
             aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
-            index, along, density = self._choose(projection, positions, frames, sensor.film(), sampler, count)
+            # Where interpolated normals go on being lit, the shadow of a mesh on itself begins at edges that are
+            # silhouettes as seen from a light: that is a jump, too, if the light has no size.
+            smooth = self.edges is not None and self.edges.any_smooth
+            lights = self.lights.places(scene) if smooth else None
+            lengths = self._visible_lengths(projection, positions, frames, lights, sensor.film())
+            index, along, density = self._choose(lengths, sampler, count)
             is_edge, is_line = index < self.counts[0], index < sum(self.counts[:2])
             along_film, valid = mi.Vector2f(0), mi.Bool(False)
             if self.edges is not None:
@@ -148,8 +157,11 @@ class FilmBoundary:
                 weights.append(weight)
             if self.edges is not None:
                 active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, index, 0), p, rays))
+            outline = mi.Bool(True)
+            if lights is not None:
+                outline = ~is_edge | self._jumps(projection, positions, dr.select(is_edge, index, 0))
             for sign, ray, weight in zip((-1, 1), rays, weights, strict=True):
-                L, alpha = radiance(ray, sampler.clone(), active)
+                L, alpha = radiance(ray, sampler.clone(), active, outline)
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
             n_dl = dr.select(active, n_dl, 0)
@@ -160,15 +172,7 @@ class FilmBoundary:
             normal_velocity = dr.dot(n_dl, velocity)
             return BoundarySamples(u, jump * normal_velocity, alpha_jump * normal_velocity, ray.wavelengths)
 
-    def _choose(
-        self,
-        projection: Projection,
-        positions: mi.Float,
-        frames: mi.Float | None,
-        film: mi.Film,
-        sampler: mi.Sampler,
-        count: int,
-    ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    def _choose(self, lengths: mi.Float, sampler: mi.Sampler, count: int) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Choose edges in proportion to their length on the film.
 
         Returns
@@ -177,8 +181,8 @@ class FilmBoundary:
         along : mi.Float, (count,), position along its visible part, uniform in [0, 1) on the film.
         density : mi.Float, (count,), expected number of samples on the edge; 0 where no edge is visible.
         """
-        length, last = self._visible_length(projection, positions, frames, film), sum(self.counts) - 1
-        quantised = mi.UInt64(dr.ceil(mi.Float64(length) / LENGTH_UNIT))
+        last = sum(self.counts) - 1
+        quantised = mi.UInt64(dr.ceil(mi.Float64(lengths) / LENGTH_UNIT))
         cumulative = dr.cumsum(quantised)
         total = mi.Float64(dr.gather(mi.UInt64, cumulative, last))
         x = (mi.Float64(dr.arange(mi.UInt32, count)) + mi.Float64(sampler.next_1d())) * (total / count)
@@ -189,22 +193,33 @@ class FilmBoundary:
         along = dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float))
         return index, along, dr.select(total > 0, mi.Float(count * size / total), 0)
 
-    def _visible_length(
-        self, projection: Projection, positions: mi.Float, frames: mi.Float | None, film: mi.Film
+    def _jumps(self, projection: Projection, positions: mi.Float, edge: mi.UInt32) -> mi.Bool:
+        """Does something jump at the edge, as seen from the sensor?"""
+        return self.edges.is_boundary(
+            positions,
+            edge,
+            projection.eye(),
+            view=projection.view() if projection.orthographic else None,
+            radius=projection.lens_radius(),
+            geometry=self.geometry,
+        )
+
+    def _visible_lengths(
+        self,
+        projection: Projection,
+        positions: mi.Float,
+        frames: mi.Float | None,
+        lights: mi.Vector4f | None,
+        film: mi.Film,
     ) -> mi.Float:
         """Length inside the frame of each edge, cut and piece of a curve, 0 where nothing can jump: pixels on the film;
         of curves, an estimate."""
         lengths = []
         if self.edges is not None:
             edge, face = (dr.arange(mi.UInt32, n) for n in self.counts[:2])
-            jumps = self.edges.is_boundary(
-                positions,
-                edge,
-                projection.eye(),
-                view=projection.view() if projection.orthographic else None,
-                radius=projection.lens_radius(),
-                geometry=self.geometry,
-            )
+            jumps = self._jumps(projection, positions, edge)
+            if lights is not None:
+                jumps |= self.edges.is_silhouette_of_any(positions, edge, lights)
             for a, b in (self.edges.end_points(positions, edge), self._cut(projection, positions, face)):
                 lengths.append(_clip(projection, projection.film(a), projection.film(b), film).length)
             lengths[0] = dr.select(jumps, lengths[0], 0)

@@ -117,7 +117,7 @@ def render_stratified(
 
     integrator : a sampling integrator of Mitsuba (`path`, `direct`, ...).
     """
-    from mitsuba.ad.integrators.common import ADIntegrator
+    from mitsuba.python.ad.integrators.common import ADIntegrator
 
     film = sensor.film()
     film.prepare([])

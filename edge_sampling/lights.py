@@ -22,13 +22,16 @@ class Lights:
     scene : mi.Scene
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("emitter", "part", "several"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("emitter", "part", "delta", "several"))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene):
         emitters = scene.emitters()
         parts = [(i, k) for i, e in enumerate(emitters) for k in range(getattr(e, "light_count", 1))]
         #: Emitter of each light, and which of its lights it is.
         self.emitter, self.part = (mi.UInt32([p[j] for p in parts]) for j in (0, 1))
+        #: Numbers of the lights without size (or with little, where an emitter consists of several). None: none.
+        delta = [k for k, (i, _) in enumerate(parts) if _may_be_delta(emitters[i])]
+        self.delta = mi.UInt32(delta) if delta else None
         #: Emitters that consist of several lights, by their number in the scene.
         self.several = {i: e for i, e in enumerate(emitters) if hasattr(e, "light_count")}
 
@@ -53,6 +56,24 @@ class Lights:
         ds, weight = dr.gather(mi.EmitterPtr, scene.emitters_dr(), emitter, active).sample_direction(it, sample, active)
         ds.pdf /= probability
         return ds, weight * probability
+
+    def places(self, scene: mi.Scene) -> mi.Vector4f | None:
+        """Where the lights without size are: mi.Vector4f, (M,), homogeneous coordinates, world space: (position, 1), or
+        (direction towards it, 0) at infinity. Detached. None: there are none."""
+        light = self.delta
+        if light is None:
+            return None
+        with dr.suspend_grad():
+            it = dr.zeros(mi.SurfaceInteraction3f, dr.width(light))
+            ds, _ = self.sample_direction(scene, light, it, mi.Point2f(0.5), mi.Bool(True))
+            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, light))
+            far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+            place = dr.select(far, mi.Point3f(ds.d), ds.p)
+            return mi.Vector4f(place.x, place.y, place.z, dr.select(far, mi.Float(0), 1))
+
+
+def _may_be_delta(emitter: mi.Emitter) -> bool:
+    return bool(emitter.flags() & mi.EmitterFlags.Delta) or hasattr(emitter, "light_count")
 
 
 def has_hard_beam(emitter: mi.Emitter) -> bool:

@@ -254,6 +254,11 @@ def smooth_torus(sensor: Callable[[], dict] = camera) -> Callable[[], mi.Scene]:
     return lambda: scene(sensor=sensor(), torus=torus(bsdf=diffuse(0.5)), environment=constant())
 
 
+def torus_in_the_sun() -> mi.Scene:
+    """Its shadow on itself begins at edges, although its normals are smooth."""
+    return scene(sensor=camera(), torus=torus(bsdf=diffuse(0.5)), lamp=sun())
+
+
 def near_plane() -> mi.Scene:
     """A long floor that passes under the camera and ends behind it."""
     quad = [[-1.2, 0, -9], [1.5, 0, -9], [-1.2, 0, 6], [1.5, 0, 6]]
@@ -534,6 +539,7 @@ DEPTH = {"key": "cube.vertex_positions", "direction": [0, 0, 1]}
 SIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.2, 1, 0]}
 DIRECTIONS = {"key": "lamp.directions", "direction": [0.3, 0, 1, 1, 0, 0, 0, 0.5, 0.5]}
+TORUS_TURN = {"key": "torus.vertex_positions", "rotate": [0.2, 1, 0.4]}
 THING_SIDE = {"key": "thing.to_world", "direction": [1, 0.3, 0]}
 THING_TURN = {"key": "thing.to_world", "rotate": [0.2, 1, 0.4]}
 LAMP_SIDE = {"key": "lamp.to_world", "direction": [1, 0.3, 0.2]}
@@ -713,6 +719,7 @@ CASES = [
     Case("discs_cube", hard_shadow(distant(5)), SIDE, 6e-3, 0.02, spp=1024, runs=24),
     Case("discs_lights", hard_shadow(distant(5)), DIRECTIONS, 1e-2, 0.02, spp=1024, runs=24),
     Case("discs_radius", hard_shadow(distant(5)), {"key": "lamp.angular_radius", "direction": [1]}, 0.2, 0.02),
+    Case("smooth_torus_sun", torus_in_the_sun, TORUS_TURN, 6e-3, tolerance=0.04, spp=1024, largest_z=7),
     # Spheres, disks and cylinders.
     Case("sphere_sun", sphere_over(sun), THING_SIDE, 6e-3, 0.02, spp=1024),
     Case("sphere_soft", sphere_over(ceiling_light), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),

@@ -81,6 +81,7 @@ VALUES = [
     ("spot", "cube.vertex_positions"),
     ("spot", "lamp.to_world"),
     ("sphere", "thing.to_world"),
+    ("torus", "torus.vertex_positions"),
 ]
 SCENES = {
     "two_triangles": cases.two_triangles,
@@ -88,6 +89,7 @@ SCENES = {
     "cube": cases.cube(),
     "spot": cases.hard_shadow(lambda: {**cases.spot(), "intensity": 100.0}),
     "sphere": cases.sphere_over(cases.sun, cases.ceiling_light),
+    "torus": cases.torus_in_the_sun,
 }
 
 

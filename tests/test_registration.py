@@ -119,6 +119,17 @@ def test_switching_variants(throwaway: None) -> None:
     assert value_of_a_pixel() == pytest.approx(2.0)
 
 
+def test_integrators_after_switching_variants() -> None:
+    """Mitsuba's Python base classes are executed again for each variant, and must be found anew."""
+    mi.set_variant("llvm_ad_spectral")
+    try:
+        for kind in ("direct_edge", "prb_edge"):
+            assert isinstance(mi.load_dict({"type": kind}), mi.Integrator)
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+    assert isinstance(mi.load_dict({"type": "direct_edge"}), mi.Integrator)
+
+
 def test_scalar_variant_is_left_alone(throwaway: None) -> None:
     rimlight.register()
     rgb = current()

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from mitsuba.ad.integrators.common import ADIntegrator
+from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from rimlight._plan import Plan, PlannedTerm, names
 from rimlight.edge_sampling import (
     Edges,
     FilmBoundary,
     Geometry,
+    Lights,
     ShadingBoundary,
     ShadowBoundary,
     Silhouettes,
@@ -185,7 +186,7 @@ class EdgeIntegrator(ADIntegrator):
     def sample(self, mode, scene, sampler, ray, active=True, beyond_horizon=False, **_):
         """Estimate the radiance along camera rays. Call it with gradients suspended: it resumes them where they belong.
 
-        beyond_horizon : turn shading normals that face away from a visible face back to its horizon, see
+        beyond_horizon : where to turn shading normals that face away from a visible face back to its horizon, see
             `up_to_horizon`.
 
         Returns
@@ -207,8 +208,8 @@ class EdgeIntegrator(ADIntegrator):
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
-        if beyond_horizon:
-            up_to_horizon(si, ray)
+        if beyond_horizon is not False:
+            up_to_horizon(si, ray, beyond_horizon)
         bsdf = si.bsdf(ray)
         valid = active & si.is_valid() & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
         if scene.environment() is not None and not self.hide_emitters:
@@ -247,9 +248,9 @@ class EdgeIntegrator(ADIntegrator):
             pi[skip] = self.skip_area_emitters(scene, onwards, True, skip)
         return pi
 
-    def _beside_edge(self, scene, ray, sampler, active) -> tuple[mi.Spectrum, mi.Float]:
+    def _beside_edge(self, scene, ray, sampler, active, outline) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha beside an edge on the film."""
-        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=True)
+        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=outline)
         return L, dr.select(valid, mi.Float(1), 0)
 
     def _seen_from_vertex(self, scene, sampler, choice, ray, shading: ShadingBoundary) -> mi.Spectrum:
@@ -329,7 +330,7 @@ class EdgeIntegrator(ADIntegrator):
         sampler.set_sample_count(1)
         sampler.set_samples_per_wavefront(1)
         sampler.seed(0xFFFFFFFF ^ seed, count)
-        s = boundary.sample(sensor, sampler, count, lambda *args: self._beside_edge(scene, *args))
+        s = boundary.sample(scene, sensor, sampler, count, lambda *args: self._beside_edge(scene, *args))
         with dr.resume_grad():
             value = Sample(mi.Spectrum(s.value * weights), s.alpha * weights)
             return Term(s.position, value, s.wavelengths, 0.0, 0)
@@ -476,7 +477,7 @@ class EdgeIntegrator(ADIntegrator):
             for limit in limits:
                 self._warn_once(limit)
             on_film = np.array([m or camera_moves for m in moving], bool)
-            film = FilmBoundary(geometry, self._edges, on_film) if on_film.any() else None
+            film = FilmBoundary(geometry, self._edges, on_film, Lights(scene)) if on_film.any() else None
             shadows, shading = self._light_boundaries(scene, moving, camera_moves or lights_move, sppi)
             self._boundaries[key] = Boundaries(film, shadows, shading, moving, camera_moves, lights_move, limits)
         if self._boundaries[key].shading is not None and not dr.flag(dr.JitFlag.FreezingScope):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.ad.integrators.common import mis_weight
+from mitsuba.python.ad.integrators.common import mis_weight
 
 
 @dataclass
@@ -202,7 +202,7 @@ class Scattering:
         return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
 
 
-def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
+def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool | bool) -> None:
     """Turn interpolated normals that face away from the viewer, on a face that does not, until they just face them.
 
     Just inside of the silhouette of a smooth-shaded mesh such normals make a black fringe, whose inner border is a
@@ -213,7 +213,7 @@ def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> None:
     side = dr.sign(dr.dot(si.n, to_viewer))
     cos = side * dr.dot(si.sh_frame.n, to_viewer)
     ε = 1e-4
-    away = si.is_valid() & (cos < ε)
+    away = active & si.is_valid() & (cos < ε)
     si.sh_frame.n = dr.select(away, dr.normalize(si.sh_frame.n + side * (ε - cos) * to_viewer), si.sh_frame.n)
     si.initialize_sh_frame()
     si.wi = dr.select(away, si.to_local(to_viewer), si.wi)
