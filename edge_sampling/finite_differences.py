@@ -14,6 +14,9 @@ from tqdm import tqdm
 from .exr import read_exr, write_exr
 from .motion import Motion
 
+#: Samples per pixel that are added up in single precision.
+PASS = 256
+
 
 @dataclass(frozen=True)
 class FiniteDifferences:
@@ -89,7 +92,7 @@ def finite_differences(
             images = []
             for theta in (step, -step, step / 2, -step / 2):
                 motion.apply(theta)
-                images.append(np.array(render_stratified(scene, integrator, camera, seed + i, spp), np.float64))
+                images.append(render_stratified(scene, integrator, camera, seed + i, spp))
             differences.append([(images[0] - images[1]) / (2 * step), (images[2] - images[3]) / step])
     finally:
         motion.apply(0.0)
@@ -110,26 +113,46 @@ def finite_differences(
     return FiniteDifferences(*(a.astype(np.float32) for a in layers), settings)
 
 
-def render_stratified(
-    scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int
-) -> mi.TensorXf:
-    """Render with the `multijitter` sampler, whichever the sensor has: (H, W, C), linear radiance.
+def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
+    """Render with the `multijitter` sampler, whichever the sensor has: (H, W, C), linear radiance, double precision.
 
     integrator : a sampling integrator of Mitsuba (`path`, `direct`, ...).
     """
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     film = sensor.film()
-    film.prepare([])
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
+    spp = sampler.sample_count()
+    # Sums of many more equal numbers are not exact enough in single precision: a difference of images shows it.
+    passes = next(n for n in range(-(-spp // PASS), spp + 1) if spp % n == 0)
     border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-    sampler.set_samples_per_wavefront(sampler.sample_count())
-    sampler.seed(seed, int(np.prod(np.array(film.crop_size()) + border)) * sampler.sample_count())
+    sampler.set_samples_per_wavefront(spp // passes)
+    sampler.seed(seed, int(np.prod(np.array(film.crop_size()) + border)) * (spp // passes))
+    images = []
     with dr.suspend_grad():
-        ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, sampler)
-        L, valid, _ = integrator.sample(scene, sampler, ray)
-        block = film.create_block()
-        alpha = dr.select(valid, mi.Float(1), 0)
-        ADIntegrator._splat_to_block(block, film, position, L * weight, 1.0, alpha, [], ray.wavelengths)
-        film.put_block(block)
-        return film.develop()
+        for _ in range(passes):
+            film.prepare([])
+            ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, _Pass(sampler, spp // passes))
+            L, valid, _ = integrator.sample(scene, sampler, ray)
+            block = film.create_block()
+            alpha = dr.select(valid, mi.Float(1), 0)
+            ADIntegrator._splat_to_block(block, film, position, L * weight, 1.0, alpha, [], ray.wavelengths)
+            film.put_block(block)
+            images.append(np.array(film.develop(), np.float64))
+            sampler.schedule_state()
+            sampler.advance()
+    return np.mean(images, axis=0)
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """A sampler, but for the number of samples that one of its passes has."""
+
+    sampler: mi.Sampler
+    count: int
+
+    def sample_count(self) -> int:
+        return self.count
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.sampler, name)
