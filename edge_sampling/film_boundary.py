@@ -48,6 +48,30 @@ class BoundarySamples:
     wavelengths: mi.Spectrum
 
 
+@dataclass(frozen=True)
+class BoundaryPoints:
+    """Points on edges, as the sensor sees them.
+
+    position : mi.Point2f, (N,), pixels, detached.
+    n_dl     : mi.Vector2f, (N,), n dl over the density of the points, pixels; zero where there is none. Detached.
+    velocity : mi.Vector2f, (N,), zero, with the gradient du/dθ of the position.
+    rays     : that look beside the edge, on its − and on its + side.
+    weights  : of these rays.
+    active   : mi.Bool, (N,)
+    outline  : mi.Bool, (N,), does the ray pass a silhouette, or something else that is one from everywhere?
+    sensor_moves : does the velocity depend on parameters of the sensor?
+    """
+
+    position: mi.Point2f
+    n_dl: mi.Vector2f
+    velocity: mi.Vector2f
+    rays: list[mi.RayDifferential3f]
+    weights: list[mi.Spectrum]
+    active: mi.Bool
+    outline: mi.Bool
+    sensor_moves: bool
+
+
 class FilmBoundary:
     """Samples the edges of a scene on the film of a sensor.
 
@@ -95,6 +119,23 @@ class FilmBoundary:
         Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by
         it, and folds of faces that are narrower on the film do not count.
         """
+        with dr.suspend_grad():
+            points = self.points(scene, sensor, sampler, count)
+            jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
+            for sign, ray, weight in zip((-1, 1), points.rays, points.weights, strict=True):
+                L, alpha = radiance(ray, sampler.clone(), points.active, points.outline)
+                jump -= sign * L * weight
+                alpha_jump -= sign * alpha
+            if points.sensor_moves:
+                # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
+                dr.eval(jump, alpha_jump, points.n_dl)
+        with dr.resume_grad():
+            normal_velocity = dr.dot(points.n_dl, points.velocity)
+            wavelengths = points.rays[1].wavelengths
+            return BoundarySamples(points.position, jump * normal_velocity, alpha_jump * normal_velocity, wavelengths)
+
+    def points(self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler, count: int) -> BoundaryPoints:
+        """Points of the film boundary, of which `sample` makes samples."""
         with dr.resume_grad():
             projection = Projection(sensor)
             positions = self.geometry.positions()
@@ -143,7 +184,6 @@ class FilmBoundary:
             if sensor.shutter_open_time() > 0:
                 time += sampler.next_1d() * sensor.shutter_open_time()
             wavelength_sample = sampler.next_1d() if mi.is_spectral else 0.0
-            jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
             rays, weights = [], []
             for sign in (-1, 1):
                 ray, weight = sensor.sample_ray_differential(
@@ -160,17 +200,8 @@ class FilmBoundary:
             outline = mi.Bool(True)
             if lights is not None:
                 outline = ~is_edge | self._jumps(projection, positions, dr.select(is_edge, index, 0))
-            for sign, ray, weight in zip((-1, 1), rays, weights, strict=True):
-                L, alpha = radiance(ray, sampler.clone(), active, outline)
-                jump -= sign * L * weight
-                alpha_jump -= sign * alpha
             n_dl = dr.select(active, n_dl, 0)
-            if projection.attached:
-                # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
-                dr.eval(jump, alpha_jump, n_dl)
-        with dr.resume_grad():
-            normal_velocity = dr.dot(n_dl, velocity)
-            return BoundarySamples(u, jump * normal_velocity, alpha_jump * normal_velocity, ray.wavelengths)
+            return BoundaryPoints(u, n_dl, velocity, rays, weights, active, outline, projection.attached)
 
     def _choose(self, lengths: mi.Float, sampler: mi.Sampler, count: int) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Choose edges in proportion to their length on the film.

@@ -26,12 +26,14 @@ class Lights:
 
     def __init__(self, scene: mi.Scene):
         emitters = scene.emitters()
-        parts = [(i, k) for i, e in enumerate(emitters) for k in range(getattr(e, "light_count", 1))]
+        counts = [getattr(e, "light_count", 1) for e in emitters]
+        firsts = [sum(counts[:i]) for i in range(len(counts))]
         #: Emitter of each light, and which of its lights it is.
-        self.emitter, self.part = (mi.UInt32([p[j] for p in parts]) for j in (0, 1))
+        self.emitter = _runs([(i, 0, n) for i, n in enumerate(counts)])
+        self.part = _runs([(0, 1, n) for n in counts])
         #: Numbers of the lights without size (or with little, where an emitter consists of several). None: none.
-        delta = [k for k, (i, _) in enumerate(parts) if _may_be_delta(emitters[i])]
-        self.delta = mi.UInt32(delta) if delta else None
+        delta = [(k, 1, n) for k, n, e in zip(firsts, counts, emitters, strict=True) if _may_be_delta(e)]
+        self.delta = _runs(delta) if delta else None
         #: Emitters that consist of several lights, by their number in the scene.
         self.several = {i: e for i, e in enumerate(emitters) if hasattr(e, "light_count")}
 
@@ -70,6 +72,25 @@ class Lights:
             far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
             place = dr.select(far, mi.Point3f(ds.d), ds.p)
             return mi.Vector4f(place.x, place.y, place.z, dr.select(far, mi.Float(0), 1))
+
+
+def _runs(runs: list[tuple[int, int, int]]) -> mi.UInt32:
+    """first, first + step, ..., of each (first, step, count). Made on the device: `dr.freeze` refuses arrays that come
+    from the host."""
+    joined: list[tuple[int, int, int]] = []
+    for first, step, count in runs:
+        before, increment, n = joined[-1] if joined else (0, 0, 0)
+        increment = first - before if n == 1 else increment
+        if n and first == before + increment * n and (count == 1 or step == increment):
+            joined[-1] = before, increment, n + count
+        else:
+            joined.append((first, step, count))
+    i, start = dr.arange(mi.UInt32, sum(count for *_, count in runs)), 0
+    numbers = i
+    for first, step, count in joined:
+        numbers = dr.select(i >= start, first + step * (i - start), numbers)
+        start += count
+    return numbers
 
 
 def _may_be_delta(emitter: mi.Emitter) -> bool:

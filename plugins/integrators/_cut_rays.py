@@ -26,6 +26,14 @@ class CutRays:
         self._cuts += [(ray.o, cut.o), (ray.d, cut.d)]
         return cut
 
+    def forward(self) -> None:
+        """Give the rays the derivative of the sensor's once and for all: they may be differentiated repeatedly."""
+        with dr.resume_grad():
+            rays = [ray for ray, _ in self._cuts]
+            derivatives = dr.forward_to(rays, flags=dr.ADFlag.ClearEdges) if rays else []
+            for (_, cut), derivative in zip(self._cuts, derivatives, strict=True):
+                dr.set_grad(cut, dr.detach(derivative))
+
     def backward(self) -> None:
         """Pass the gradients on."""
         gradients = [dr.grad(cut) for _, cut in self._cuts]

@@ -50,7 +50,7 @@ def scattered_light(
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), sampler, active)
         L += dr.select(active, vertex.β * direct, 0)
-        vertex, active = _step(vertex, onwards, sampler, depths, active)
+        vertex, active = step(vertex, onwards, sampler, depths, active)
         return L, vertex, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
@@ -130,7 +130,7 @@ class Replay:
                 else:
                     dr.backward_from(δL * Lo, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
             before = vertex
-            vertex, active = _step(vertex, onwards, sampler, depths, active)
+            vertex, active = step(vertex, onwards, sampler, depths, active)
             return L, tangent, before, vertex, active, sampler
 
         vertex = self.vertex
@@ -168,7 +168,7 @@ def choose_vertex(
         bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
         ray = si.spawn_ray(si.to_world(bs.wo))
         pi = scene.ray_intersect_preliminary(ray, active=active & depths.scatters(vertex.depth + 1))
-        vertex, active = _step(vertex, Next(ray, pi, weight, bs.eta), sampler, depths, active)
+        vertex, active = step(vertex, Next(ray, pi, weight, bs.eta), sampler, depths, active)
         return total, kept, vertex, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
@@ -180,7 +180,7 @@ def choose_vertex(
     return kept, total > 0
 
 
-def _step(vertex, onwards, sampler, depths, active):
+def step(vertex, onwards, sampler, depths, active):
     """The next vertex, and whether the path goes on there. Paths end at random as in Mitsuba's `path`."""
     β = vertex.β * dr.detach(onwards.weight)
     η = vertex.η * onwards.η

@@ -64,21 +64,39 @@ class Scattering:
 
     def sample_emitter(self, si, bsdf, sampler, active):
         """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,)."""
-        scene, context = self.scene, mi.BSDFContext()
-        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         sample = sampler.next_2d(active)
-        ds, weight = scene.sample_emitter_direction(si, sample, not self.attached, active)
+        towards_light = lambda active: self.scene.sample_emitter_direction(si, sample, False, active)
+        return self.reflect(si, bsdf, towards_light, active)
+
+    def reflect(self, si, bsdf, towards_light, active):
+        """Radiance reflected at `si` by what `towards_light` samples: mi.Spectrum, (N,).
+
+        towards_light : maps `active` to a direction and the light from there over its density, as Mitsuba's
+            `Emitter.sample_direction` with fixed random numbers. Visibility is tested here.
+        """
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        with dr.resume_grad(when=self.attached and not self.any_hit_by_rays):
+            ds, weight = towards_light(active)
         active &= ds.pdf != 0
         direction = ds.d
-        if self.attached:
-            direction, weight, visible = self._attach_emitter(si, ds, weight, sample, active)
+        if self.attached and self.any_hit_by_rays:
+            direction, weight, visible = self._attach_emitter(si, ds, weight, towards_light, active)
             active &= visible
         with dr.resume_grad(when=self.attached):
-            f, pdf = bsdf.eval_pdf(context, si, si.to_local(direction), active)
-            mis = dr.select(ds.delta | self._found_by_light_samples(ds), 1, mis_weight(ds.pdf, dr.detach(pdf)))
-            return dr.select(active, f * weight * mis, 0)
+            f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
+            mis = dr.select(ds.delta | self._found_by_light_samples(ds), 1, mis_weight(dr.detach(ds.pdf), dr.detach(pdf)))
+            L = dr.select(active, f * weight * mis, 0)
+        if not self.attached:
+            active &= dr.any(L != 0)
+        elif not self.any_hit_by_rays:
+            active &= dr.any(f != 0) | (pdf > 0)  # what is black may still become brighter
+        else:
+            return L
+        active &= ~self.scene.ray_test(si.spawn_ray_to(ds.p), active)
+        with dr.resume_grad(when=self.attached):
+            return dr.select(active, L, 0)
 
-    def _attach_emitter(self, si, ds, weight, sample, active):
+    def _attach_emitter(self, si, ds, weight, towards_light, active):
         """Direction and weight (Lₑ · geometry / density) of a light sample with their gradients, and its visibility."""
         scene = self.scene
         on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
@@ -99,7 +117,7 @@ class Scattering:
             if self.any_delta or self.several:
                 # A point of a disc follows it.
                 follows = ds.delta | self._of_several(ds.emitter)
-                moved, at_moved = scene.sample_emitter_direction(si, sample, False, active & follows)
+                moved, at_moved = towards_light(active & follows)
                 direction = dr.select(follows, moved.d, direction)
                 attached = dr.select(follows, at_moved, attached)
             return direction, dr.replace_grad(weight, attached), visible
@@ -132,13 +150,19 @@ class Scattering:
                     y = dr.select(mirrored, slid, y)
                     attached = dr.select(mirrored, at_mirror, attached)
                 weight = dr.replace_grad(weight, dr.select(active, attached, 0))
+        if not self.any_hit_by_rays:
+            return mi.Spectrum(0), Next(ray, pi, weight, bs.eta)
         emitter = y.emitter(scene, active)
         ds = mi.DirectionSample3f(scene, y, si)
-        pdf = scene.pdf_emitter_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
+        pdf = self.pdf_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
         mis = dr.select(mirrored, 1, mis_weight(bs.pdf, pdf))
         with dr.resume_grad(when=self.attached):
             Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
         return Le, Next(ray, pi, weight, bs.eta)
+
+    def pdf_direction(self, si, ds, active) -> mi.Float:
+        """Density with which `ds` would have been sampled as a light."""
+        return self.scene.pdf_emitter_direction(si, ds, active)
 
     # ---------------------- Emitters of several lights ----------------------
 

@@ -1,0 +1,457 @@
+"""Camera paths whose vertices are all lit by every light of a scene, one after the other.
+
+A path is traced once. At each of its vertices a loop runs over the lights, in which the surface, the throughput and
+the footprint on the film stay as they are. What becomes of the light differs: it is added to the layers (`Splat`),
+compared with gradients that the layers hold (`Measure`), or differentiated in either mode (`Forward`, `Backward`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight.edge_sampling import Lights
+
+from ._cut_rays import CutRays
+from ._layers import Layers
+from ._paths import Depths, Vertex, step
+from ._scattering import Scattering, up_to_horizon
+
+#: Light samples of one vertex differ by these, modulo 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom
+#: sequences", R2). By itself, each is uniform.
+TURN = (0.7548776662466927, 0.5698402909980532)
+
+
+class LightByLight(Scattering):
+    """What surfaces scatter of one light.
+
+    lights : their number is K.
+    per_path : how many of them are evaluated at each vertex, 0 for all.
+    """
+
+    def __init__(self, scene: mi.Scene, lights: Lights, per_path: int, *, attached: bool):
+        super().__init__(scene, attached=attached)
+        self.lights, self.count = lights, per_path or len(lights)
+        self.several = list(lights.several.values())
+
+    def direct(self, si, bsdf, light: mi.UInt32, sample: mi.Point2f | None, active) -> mi.Spectrum:
+        """Radiance of a light that `si` reflects without detours: mi.Spectrum, (N,). If not all lights are evaluated, it
+        also stands for the others."""
+        point = mi.Point2f(0.5)  # lights without an extent do not look at it
+        if sample is not None:
+            turned = sample + mi.Point2f(TURN) * mi.Float(light)
+            point = dr.minimum(turned - dr.floor(turned), dr.one_minus_epsilon(mi.Float))
+        towards_light = lambda active: self.lights.sample_direction(self.scene, light, si, point, active)
+        L = self.reflect(si, bsdf, towards_light, active)
+        with dr.resume_grad(when=self.attached):
+            return L if self.count == len(self.lights) else L * (len(self.lights) / self.count)
+
+    def pdf_direction(self, si, ds, active) -> mi.Float:
+        return ds.emitter.pdf_direction(si, ds, active)
+
+    def number(self, emitter: mi.EmitterPtr) -> mi.UInt32:
+        """Number of the light that rays hit."""
+        light, first = mi.UInt32(0), 0
+        for e in self.scene.emitters():
+            if not e.flags() & mi.EmitterFlags.Delta:
+                light = dr.select(emitter == mi.EmitterPtr(e), first, light)
+            first += getattr(e, "light_count", 1)
+        return light
+
+    def each(self, step: Callable, state: tuple, choice: mi.Float | None, active: mi.Bool) -> tuple:
+        """Loop over the lights: `state = step(light, *state)`. All of them, or those that `choice` makes of as many
+        equal parts of their list, one of each."""
+        count, total = self.count, len(self.lights)
+
+        def body(j, *state):
+            light = j if choice is None else dr.minimum(mi.UInt32((mi.Float(j) + choice) * (total / count)), total - 1)
+            return (j + 1, *step(light, *state))
+
+        return dr.while_loop((mi.UInt32(0), *state), lambda j, *_: active & (j < count), body, label="lights")[1:]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A vertex of each path, as the loop over the lights needs it.
+
+    number : along the path; 1 is what the camera sees.
+    ray, pi : the ray to it and what that meets; the first ray is attached to the camera.
+    before : ray and intersection of the vertex before, None for the first.
+    throughput : mi.Spectrum, detached.
+    scale : mi.Spectrum, what the radiance of the path is multiplied by.
+    u : mi.Point2f, position on the film, pixels.
+    sample : mi.Point2f, random numbers for lights with an extent, or None.
+    choice : mi.Float, which lights are evaluated; None for all.
+    """
+
+    number: int
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    before: tuple[mi.Ray3f, mi.PreliminaryIntersection3f] | None
+    throughput: mi.Spectrum
+    scale: mi.Spectrum
+    u: mi.Point2f
+    sample: mi.Point2f | None
+    choice: mi.Float | None
+
+    @property
+    def β(self) -> mi.Spectrum:
+        """What light at this vertex is multiplied by."""
+        return self.throughput * self.scale
+
+    def surface(self, scattering: Scattering, beyond_horizon: bool, active) -> mi.SurfaceInteraction3f:
+        """The surface there; attached, if `scattering` is, to a ray that is fixed on the film, and from the second
+        vertex on to the material point."""
+        follow = lambda number: mi.RayFlags.FollowShape if number > 1 else mi.RayFlags.Empty
+        with dr.resume_grad(when=scattering.attached):
+            flags = mi.RayFlags.All | follow(self.number)
+            si = self.pi.compute_surface_interaction(self.ray, flags, active)
+            if scattering.attached and self.before is not None and scattering.directional:
+                ray, pi = self.before
+                flags = mi.RayFlags.Minimal | follow(self.number - 1)
+                x = pi.compute_surface_interaction(ray, flags, active).p
+                si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
+        if beyond_horizon and self.number == 1:
+            up_to_horizon(si, self.ray)
+        return si
+
+    def in_front(self, active: mi.Bool) -> tuple[Place, mi.Bool, mi.UInt32]:
+        """The active paths moved together, in their order: packets without one skip the loop over the lights. Measured
+        with 96 lights, 10 % faster where most paths are active, and in proportion to their number where few are.
+
+        Returns
+        -------
+        place : zero where there is none.
+        active : mi.Bool, (N,)
+        index : mi.UInt32, (N,), where each comes from.
+        """
+        n = dr.width(active)
+        order = dr.cumsum(dr.select(active, mi.UInt32(1), 0))
+        index, lane = dr.zeros(mi.UInt32, n), dr.arange(mi.UInt32, n)
+        dr.scatter(index, lane, order - 1, active)
+        there = lane < dr.gather(mi.UInt32, order, n - 1)
+        at = lambda value: None if value is None else dr.gather(type(value), value, index, there)
+        with dr.resume_grad():
+            before = None if self.before is None else tuple(at(v) for v in self.before)
+            moved = {k: at(getattr(self, k)) for k in ("ray", "pi", "throughput", "scale", "u", "sample", "choice")}
+        return replace(self, before=before, **moved), there, index
+
+
+class Splat:
+    """Adds the radiance to the layers."""
+
+    attached = False
+
+    def __init__(self, layers: Layers):
+        self.layers = layers
+
+    def start(self, ray: mi.Ray3f) -> mi.Ray3f:
+        """Camera rays as the paths shall see them."""
+        return ray
+
+    def emission(self, light, value, place, active) -> None:
+        self.layers.add(self.layers.footprint(place.u, active), light, place.β * value, active)
+
+    def direct(self, scattering, place, beyond_horizon, active) -> None:
+        place, active, _ = place.in_front(active)
+        si = place.surface(scattering, beyond_horizon, active)
+        bsdf, at = si.bsdf(place.ray), self.layers.footprint(place.u, active)
+
+        def step(light):
+            value = scattering.direct(si, bsdf, light, place.sample, active)
+            self.layers.add(at, light, place.β * value, active & dr.any(value != 0))
+            return ()
+
+        scattering.each(step, (), place.choice, active)
+
+    def bounce(self, light, emitted, weight, place, active) -> None:
+        if light is not None:
+            self.emission(light, emitted, place, active)
+
+
+class Measure(Splat):
+    """The radiance times the gradient that the layers hold, summed over the lights.
+
+    total : mi.Float, (N,), for each path.
+    """
+
+    def __init__(self, layers: Layers):
+        super().__init__(layers)
+        self.total = mi.Float(0)
+
+    def emission(self, light, value, place, active) -> None:
+        δ = self.layers.at(self.layers.footprint(place.u, active), light, active)
+        self.total += dr.select(active, dr.sum(δ * place.β * value), 0)
+
+    def direct(self, scattering, place, beyond_horizon, active) -> None:
+        place, active, index = place.in_front(active)
+        si = place.surface(scattering, beyond_horizon, active)
+        bsdf, at = si.bsdf(place.ray), self.layers.footprint(place.u, active)
+
+        def step(light, total):
+            value = scattering.direct(si, bsdf, light, place.sample, active)
+            return (total + dr.sum(self.layers.at(at, light, active) * place.β * value),)
+
+        total = scattering.each(step, (dr.zeros(mi.Float, dr.width(active)),), place.choice, active)[0]
+        self.total += _back(total, index, active)
+
+
+class Forward:
+    """Adds the derivative of the radiance to the layers.
+
+    tangent : mi.Spectrum, (N,), derivative of the throughput.
+    """
+
+    attached = True
+
+    def __init__(self, layers: Layers):
+        self.layers = layers
+        self.tangent = mi.Spectrum(0)
+
+    def start(self, ray: mi.Ray3f) -> mi.Ray3f:
+        rays = CutRays(dr.ADMode.Backward)
+        cut = rays(ray)
+        rays.forward()
+        return cut
+
+    def emission(self, light, value, place, active) -> None:
+        with dr.resume_grad():
+            (derivative,) = _derivatives([value])
+        self.layers.add(self.layers.footprint(place.u, active), light, place.β * derivative, active)
+
+    def direct(self, scattering, place, beyond_horizon, active) -> None:
+        before = _wide(self.tangent, active)
+        place, active, index = place.in_front(active)
+        tangent = dr.gather(mi.Spectrum, before, index, active)
+        si = place.surface(scattering, beyond_horizon, active)
+        with dr.resume_grad():
+            attached = _attached(si)
+            which, derivatives = list(attached), _derivatives(list(attached.values()))
+        del attached
+        si = dr.detach(si)
+        bsdf, at = si.bsdf(place.ray), self.layers.footprint(place.u, active)
+
+        def step(light):
+            with dr.resume_grad():
+                local, fields = _local(si, which)
+                for field, derivative in zip(fields, derivatives, strict=True):
+                    dr.set_grad(field, derivative)
+            value = scattering.direct(local, bsdf, light, place.sample, active)
+            with dr.resume_grad():
+                (derivative,) = _derivatives([value])
+            derivative = tangent * dr.detach(value) + place.β * derivative
+            self.layers.add(at, light, derivative, active & dr.any(derivative != 0))
+            return ()
+
+        scattering.each(step, (), place.choice, active)
+
+    def bounce(self, light, emitted, weight, place, active) -> None:
+        with dr.resume_grad():
+            derivatives = _derivatives([emitted, weight])
+        if light is not None:
+            derivative = self.tangent * dr.detach(emitted) + place.β * derivatives[0]
+            self.layers.add(self.layers.footprint(place.u, active), light, derivative, active)
+        self.tangent = self.tangent * dr.detach(weight) + place.β * derivatives[1]
+
+
+class Backward:
+    """Propagates the gradient that the layers hold to the parameters, `finish` included."""
+
+    attached = True
+
+    def __init__(self, layers: Layers):
+        self.layers = layers
+        self.light: list[mi.Spectrum] = []  # of each vertex, times its throughput and its gradient
+        self.weights: list[mi.Spectrum] = []  # of the step after each vertex; attached
+        self.emitted = mi.Float(0)  # attached
+        self.start = self.rays = CutRays(dr.ADMode.Backward)
+
+    def emission(self, light, value, place, active) -> None:
+        δ = self.layers.at(self.layers.footprint(place.u, active), light, active) * place.β
+        if self.light:
+            self.light[-1] += dr.select(active, δ * dr.detach(value), 0)
+        with dr.resume_grad():
+            self.emitted += dr.select(active, dr.sum(δ * value), 0)
+
+    def direct(self, scattering, place, beyond_horizon, active) -> None:
+        place, active, index = place.in_front(active)
+        si = place.surface(scattering, beyond_horizon, active)
+        with dr.resume_grad():
+            attached = _attached(si)
+        bsdf, at = si.bsdf(place.ray), self.layers.footprint(place.u, active)
+
+        def step(light, total, *gradients):
+            δ = self.layers.at(at, light, active) * place.β
+            with dr.resume_grad():
+                local, fields = _local(si, attached)
+            value = scattering.direct(local, bsdf, light, place.sample, active)
+            with dr.resume_grad():
+                value = δ * value
+                dr.backward_from(dr.sum(value), flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+                gradients = [g + dr.grad(field) for g, field in zip(gradients, fields, strict=True)]
+            return total + dr.detach(value), *gradients
+
+        # The surface gets its gradient once, not once for each light.
+        width = dr.width(active)
+        state = [dr.zeros(mi.Spectrum, width), *(dr.zeros(type(field), width) for field in attached.values())]
+        total, *gradients = scattering.each(step, tuple(state), place.choice, active)
+        with dr.resume_grad():
+            for field, gradient in zip(attached.values(), gradients, strict=True):
+                dr.set_grad(field, gradient)
+                dr.enqueue(dr.ADMode.Backward, field)
+            dr.traverse(dr.ADMode.Backward)
+        self.light.append(_back(total, index, active))
+        dr.eval(self.light)
+
+    def bounce(self, light, emitted, weight, place, active) -> None:
+        if light is not None:
+            self.emission(light, emitted, place, active)
+        self.weights.append(weight)
+
+    def finish(self) -> None:
+        """The throughput of each vertex is a product: of a factor's gradient, all vertices beyond it have a share."""
+        beyond = mi.Spectrum(0)
+        with dr.resume_grad():
+            total = self.emitted
+            for light, weight in zip(reversed(self.light[1:]), reversed(self.weights[: len(self.light) - 1]), strict=True):
+                beyond += light
+                now = dr.detach(weight)
+                total += dr.sum(dr.select(now != 0, beyond * weight / now, 0))
+            dr.backward_from(total, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+            self.rays.backward()
+
+
+class LightPaths:
+    """Camera paths, and the loops over the lights at their vertices.
+
+    first_hit : maps (scene, ray, active) to what camera rays meet.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        lights: Lights,
+        depths: Depths,
+        per_path: int,
+        hide_emitters: bool,
+        first_hit: Callable[..., mi.PreliminaryIntersection3f],
+    ):
+        self.scene, self.lights, self.depths, self.per_path = scene, lights, depths, per_path
+        self.hide_emitters, self.first_hit = hide_emitters, first_hit
+
+    def trace(
+        self,
+        to: Any,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        u: mi.Point2f,
+        scale: mi.Spectrum,
+        choice: mi.Float | None = None,
+        active: mi.Bool | bool = True,
+        beyond_horizon: bool = False,
+    ) -> None:
+        """Trace paths, and hand the light at their vertices over. Call it with gradients suspended.
+
+        to : `Splat`, `Measure`, `Forward` or `Backward`.
+        ray : camera rays, attached if the camera is.
+        u : their positions on the film, pixels.
+        scale : mi.Spectrum, (N,), what their radiance is multiplied by. Detached.
+        choice : mi.Float, (N,), uniform; which lights are evaluated. None if all of them are.
+        beyond_horizon : as for `EdgeIntegrator.sample`.
+        """
+        scattering = LightByLight(self.scene, self.lights, self.per_path, attached=to.attached)
+        area = scattering.any_hit_by_rays
+        active = mi.Bool(active) & (self.depths.max_depth > 0)
+        with dr.resume_grad(when=to.attached):
+            ray = _wide(mi.Ray3f(ray), dr.full(mi.Bool, True, dr.width(u)))
+        ray = to.start(ray)
+        pi = self.first_hit(self.scene, ray, active)
+        one, zero = (dr.full(mi.Spectrum, value, dr.width(u)) for value in (1, 0))
+        place = Place(1, ray, pi, None, one, scale + zero, u, None, choice)
+        if area and not self.hide_emitters:
+            self._seen(to, scattering, place, beyond_horizon, active)
+        active &= pi.is_valid()
+        η = mi.Float(1)
+        while self.depths.scatters(place.number):
+            sample = sampler.next_2d(active) if area else None
+            place = replace(place, throughput=_wide(place.throughput, active), sample=sample)
+            sampler.schedule_state()
+            dr.eval(place, active)
+            to.direct(scattering, place, beyond_horizon, active)
+            if not (area or self.depths.scatters(place.number + 1)):
+                break
+            place, η, active = self._onwards(to, scattering, place, η, sampler, beyond_horizon, active)
+        dr.eval()
+
+    # In functions of their own: forward mode must not meet what is left of earlier attached values.
+
+    def _seen(self, to, scattering, place, beyond_horizon, active) -> None:
+        """What the first vertex emits."""
+        si = place.surface(scattering, beyond_horizon, active)
+        emitter = si.emitter(self.scene)
+        with dr.resume_grad(when=to.attached):
+            value = emitter.eval(si, active)
+        to.emission(scattering.number(emitter), value, place, active)
+
+    def _onwards(self, to, scattering, place, η, sampler, beyond_horizon, active) -> tuple[Place, mi.Float, mi.Bool]:
+        """The next vertex, and what it emits."""
+        si = place.surface(scattering, beyond_horizon, active)
+        emitted, onwards = scattering.sample_bsdf(si, si.bsdf(place.ray), sampler, active)
+        light = None
+        if scattering.any_hit_by_rays:
+            y = onwards.pi.compute_surface_interaction(onwards.ray, mi.RayFlags.Minimal, active)
+            light = scattering.number(y.emitter(self.scene))
+        vertex = Vertex(place.ray, place.pi, place.number, place.throughput, η)
+        after, goes_on = step(vertex, onwards, sampler, self.depths, active)
+        # What Russian roulette divides by belongs to the throughput.
+        with dr.resume_grad(when=to.attached):
+            now = place.throughput * dr.detach(onwards.weight)
+            weight = onwards.weight * dr.select(goes_on & (now != 0), after.β / now, 0)
+        to.bounce(light, emitted, weight, place, active)
+        before = (place.ray, place.pi) if to.attached else None
+        onto = {"ray": after.ray, "pi": after.pi, "before": before, "throughput": after.β}
+        place = replace(place, number=after.depth, **onto)
+        return place, after.η, goes_on
+
+
+# ---------------------- Gradients of a surface interaction ----------------------
+
+
+def _fields(si: mi.SurfaceInteraction3f) -> list:
+    frame = si.sh_frame
+    return [si.p, si.n, si.uv, si.wi, frame.s, frame.t, frame.n, si.dp_du, si.dp_dv, si.dn_du, si.dn_dv]
+
+
+def _attached(si: mi.SurfaceInteraction3f) -> dict:
+    """Its fields that carry a gradient, by their number."""
+    return {i: field for i, field in enumerate(_fields(si)) if dr.grad_enabled(field)}
+
+
+def _local(si: mi.SurfaceInteraction3f, which: Iterable[int]) -> tuple[mi.SurfaceInteraction3f, list]:
+    """A copy that depends on nothing, and those of its fields that shall carry a gradient."""
+    local = dr.detach(si)
+    fields = [_fields(local)[i] for i in which]
+    dr.enable_grad(fields)
+    return local, fields
+
+
+def _derivatives(values: list) -> list:
+    """Of what is attached, along the gradients of the parameters. Detached. All that shares a graph goes in one call."""
+    found = dr.forward_to(values, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad) if values else []
+    return [dr.detach(value) for value in found]
+
+
+def _wide(value: Any, active: mi.Bool) -> Any:
+    """As many lanes as `active` has, with zeros where it is not."""
+    return dr.select(active, value, dr.zeros(type(value)))
+
+
+def _back(value: Any, index: mi.UInt32, active: mi.Bool) -> Any:
+    """Undo `Place.in_front`."""
+    result = dr.zeros(type(value), dr.width(active))
+    dr.scatter(result, value, index, active, mode=dr.ReduceMode.Permute)
+    return result

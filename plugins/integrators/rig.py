@@ -1,0 +1,182 @@
+"""Plugin `rig`: one image for each light of a scene, from camera paths that all lights share."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight.edge_sampling import FilmBoundary, Lights, stratified
+
+from ._edge_integrator import HARD_SHADOWS, Boundaries, EdgeIntegrator
+from ._layers import Layers, LayerSamples
+from ._light_paths import Backward, Forward, LightPaths, Measure, Splat
+
+SHADOWS_ON_FILM = (
+    "the derivative has the shadows that lights throw on what the camera sees, but lacks those of the environment and "
+    'all that edges do to indirect light; set "sppi" to 0 to accept this.'
+)
+
+#: Longest path. A derivative keeps all of its vertices in memory.
+LONGEST = 16
+
+
+class RigIntegrator(EdgeIntegrator):
+    def __init__(self, props: mi.Properties):
+        who = props.plugin_name()
+        limits = {"max_depth": (2, 0, LONGEST), "rr_depth": (5, 1, None), "lights_per_path": (0, 0, None)}
+        values = {key: _whole(who, props, key, *limit) for key, limit in limits.items()}
+        super().__init__(props, max_depth=values["max_depth"], rr_depth=values["rr_depth"])
+        if mi.is_spectral:
+            raise ValueError(f"{who}: spectral variants are not supported, got {mi.variant()}")
+        self.lights_per_path = values["lights_per_path"]
+
+    # ---------------------- Mitsuba's interface ----------------------
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """The layers: mi.TensorXf, (H, W, 3 K), linear radiance."""
+        with dr.suspend_grad():
+            sensor = self._sensor(scene, sensor)
+            paths = self._paths(scene)
+            sampler, spp = self._sampler(sensor, seed, spp or sensor.sampler().sample_count())
+            ray, weight, u = self.sample_rays(scene, sensor, sampler)
+            layers = Layers(sensor.film(), len(paths.lights), u, spp)
+            paths.trace(Splat(layers), sampler, ray, u, weight / spp, self._choice(sampler, seed))
+            return layers.image()
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        """Derivative of the layers along the gradients that are set on the parameters.
+
+        Returns
+        -------
+        mi.TensorXf, (H, W, 3 K), linear radiance per unit of the parameter.
+        """
+        if params is not None and not dr.grad_enabled(dict(params)):
+            raise RuntimeError(f"{self.name}: none of the parameters carries a gradient")
+        with dr.suspend_grad():
+            return self._differentiate(scene, sensor, seed, spp, None).image()
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        """Add to the gradients of the parameters what `grad_in`, (H, W, 3 K), the gradient of a loss with respect to
+        the layers, makes of them."""
+        with dr.isolate_grad(), dr.suspend_grad():
+            self._differentiate(scene, sensor, seed, spp, grad_in)
+            dr.eval()
+
+    # ---------------------- Derivative ----------------------
+
+    def _differentiate(self, scene, sensor, seed, spp, grad_in) -> Layers:
+        """All terms, in forward mode, or given a gradient, in backward mode."""
+        forward = grad_in is None
+        sensor = self._sensor(scene, sensor)
+        sppc, sppp, sppi = self._counts(spp, sensor)
+        boundaries = self._boundaries_of(scene, sensor, sppi)
+        paths = self._paths(scene)
+        sampler, spp = self._sampler(sensor, seed, sppc or 16)
+        ray, weight, u = self.sample_rays(scene, sensor, sampler)
+        layers = Layers(sensor.film(), len(paths.lights), u, spp, grad_in)
+        if sppc:
+            to = Forward(layers) if forward else Backward(layers)
+            paths.trace(to, sampler, ray, u, dr.detach(weight) / spp, self._choice(sampler, seed))
+            if not forward:
+                to.finish()
+        if boundaries.film is not None and sppp:
+            self._film_boundary(scene, sensor, seed, sppp, paths, layers, boundaries.film, forward)
+        if boundaries.shadows is not None:
+            samples = self._shadows(scene, sensor, seed, sppi, boundaries)
+            layers.forward(samples) if forward else layers.backward(samples)
+        return layers
+
+    def _shadows(self, scene, sensor, seed, sppi, boundaries: Boundaries) -> LayerSamples:
+        """Shadows on what the camera sees; each belongs to one light."""
+        boundaries.silhouettes.refit()
+        sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
+        s = boundaries.shadows.sample(scene, sensor, sampler, self._first_hit, share=False)
+        return LayerSamples(s.position, s.light, s.value)
+
+    def _film_boundary(self, scene, sensor, seed, sppp, paths, layers, boundary: FilmBoundary, forward) -> None:
+        """Visibility as seen from the sensor: all lights, on both sides of the edges."""
+        count, seed = self._line_samples(sensor, sppp), 0xFFFFFFFF ^ seed
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(1)
+        sampler.set_samples_per_wavefront(1)
+        sampler.seed(seed, count)
+        points = boundary.points(sensor, sampler, count)
+        with dr.resume_grad():
+            normal_velocity = dr.dot(points.n_dl, points.velocity)
+        weight = 1.0
+        if forward:
+            with dr.resume_grad():
+                weight = dr.forward_to(normal_velocity, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+            weight = dr.detach(weight)
+        choice = self._choice(sampler, seed)
+        to = Splat(layers) if forward else Measure(layers)
+        for sign, ray, ray_weight in zip((1, -1), points.rays, points.weights, strict=True):
+            scale = ray_weight * (sign * weight)
+            paths.trace(to, sampler.clone(), ray, points.position, scale, choice, points.active, beyond_horizon=True)
+        if not forward:
+            dr.eval(to.total, points.n_dl)
+            with dr.resume_grad():
+                normal_velocity = dr.dot(points.n_dl, points.velocity)
+                dr.backward_from(to.total * normal_velocity, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+
+    def _light_boundaries(self, *args):
+        shadows, _ = super()._light_boundaries(*args)
+        return shadows, None
+
+    def _limits(self, scene, moving, camera_moves, sppi) -> tuple[str, ...]:
+        limits = super()._limits(scene, moving, camera_moves, sppi)
+        if sppi > 0 and (self.depths.scatters(2) or scene.environment() is not None):
+            limits = (*(limit for limit in limits if limit != HARD_SHADOWS), SHADOWS_ON_FILM)
+        return limits
+
+    # ---------------------- Lights ----------------------
+
+    def light_names(self, scene: mi.Scene) -> list[str]:
+        """A name for each layer, in their order: the identifier of the emitter, with a number if it consists of several
+        lights or if another has the same identifier."""
+        names = []
+        for e in scene.emitters():
+            several = hasattr(e, "light_count")
+            names += [f"{e.id()}{k:02d}" for k in range(e.light_count)] if several else [e.id()]
+        return [n if names.count(n) == 1 else f"{n}_{names[:i].count(n)}" for i, n in enumerate(names)]
+
+    def _lights(self, scene) -> Lights:
+        mirrors = any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes())
+        for e in scene.emitters():
+            if not hasattr(e, "light_count") or e.flags() & mi.EmitterFlags.Delta:
+                continue
+            who = f'{self.name}: "{e.id()}" ({e.class_name()})'
+            if getattr(e, "background", None) is not None:
+                raise RuntimeError(f"{who} has a background, which is none of its lights; make it an emitter of its own")
+            if mirrors or not self.hide_emitters:
+                where = "in perfect mirrors; make these rough" if mirrors else 'directly; set "hide_emitters"'
+                raise RuntimeError(f"{who} has several lights, and which of them is seen is unknown {where}")
+        lights = Lights(scene)
+        if len(lights) < max(self.lights_per_path, 1):
+            few = f'only {len(lights)} of "lights_per_path" {self.lights_per_path}' if len(lights) else "no"
+            raise RuntimeError(f"{self.name}: the scene has {few} lights")
+        return lights
+
+    def _paths(self, scene) -> LightPaths:
+        lights, options = self._lights(scene), (self.lights_per_path, self.hide_emitters)
+        return LightPaths(scene, lights, self.depths, *options, self._first_hit)
+
+    def _choice(self, sampler, seed) -> mi.Float | None:
+        """Random numbers that choose lights, stratified over the samples of a pixel, or over neighbours."""
+        return stratified(sampler, seed) if self.lights_per_path else None
+
+    @staticmethod
+    def _sensor(scene, sensor) -> mi.Sensor:
+        return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def _whole(who: str, props: mi.Properties, key: str, default: int, least: int, most: int | None) -> int:
+    value = props.get(key, default)
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if not whole or value < least or (most is not None and value > most):
+        wanted = f">= {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f'{who}: "{key}" must be a whole number {wanted}, got {value}')
+    return value
+
+
+mi.register_integrator("rig", RigIntegrator)
