@@ -42,9 +42,7 @@ class Layers:
     RuntimeError : there are too many pixels.
     """
 
-    def __init__(
-        self, film: mi.Film, lights: int, position: mi.Point2f, spp: int, data: mi.TensorXf | None = None
-    ):
+    def __init__(self, film: mi.Film, lights: int, position: mi.Point2f, spp: int, data: mi.TensorXf | None = None):
         self.offset, self.size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2i(film.crop_size())
         self.channels = 1 if mi.is_monochromatic else 3
         self.stride = lights * self.channels

@@ -317,7 +317,9 @@ class Backward:
         beyond = mi.Spectrum(0)
         with dr.resume_grad():
             total = self.emitted
-            for light, weight in zip(reversed(self.light[1:]), reversed(self.weights[: len(self.light) - 1]), strict=True):
+            for light, weight in zip(
+                reversed(self.light[1:]), reversed(self.weights[: len(self.light) - 1]), strict=True
+            ):
                 beyond += light
                 now = dr.detach(weight)
                 total += dr.sum(dr.select(now != 0, beyond * weight / now, 0))

@@ -84,7 +84,9 @@ class Scattering:
             active &= visible
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
-            mis = dr.select(ds.delta | self._found_by_light_samples(ds), 1, mis_weight(dr.detach(ds.pdf), dr.detach(pdf)))
+            mis = dr.select(
+                ds.delta | self._found_by_light_samples(ds), 1, mis_weight(dr.detach(ds.pdf), dr.detach(pdf))
+            )
             L = dr.select(active, f * weight * mis, 0)
         if not self.attached:
             active &= dr.any(L != 0)

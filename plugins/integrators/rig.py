@@ -147,7 +147,9 @@ class RigIntegrator(EdgeIntegrator):
                 continue
             who = f'{self.name}: "{e.id()}" ({e.class_name()})'
             if getattr(e, "background", None) is not None:
-                raise RuntimeError(f"{who} has a background, which is none of its lights; make it an emitter of its own")
+                raise RuntimeError(
+                    f"{who} has a background, which is none of its lights; make it an emitter of its own"
+                )
             if mirrors or not self.hide_emitters:
                 where = "in perfect mirrors; make these rough" if mirrors else 'directly; set "hide_emitters"'
                 raise RuntimeError(f"{who} has several lights, and which of them is seen is unknown {where}")
