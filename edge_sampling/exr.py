@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,52 @@ def write_exr(
                 file.write(str(temporary))
         except RuntimeError as error:
             raise OSError(f"cannot write {path}: {error}") from None
+
+
+def write_layers(
+    path: str | Path, image: np.ndarray, names: Sequence[str], metadata: Mapping[str, str | float | int] | None = None
+) -> None:
+    """Write an image of many layers, as the integrator `rig` renders it, to one OpenEXR file.
+
+    Parameters
+    ----------
+    image : (H, W, C K), the channels of one layer after those of another; C is 1 or 3.
+    names : of the K layers. Their channels are called ``name.R`` etc., or ``name.Y``.
+    metadata : as for `write_exr`. The order of the layers is stored in the attribute ``layers``.
+
+    Raises
+    ------
+    ValueError : two layers have the same name, one has none, or the image does not divide into so many.
+    OSError : as for `write_exr`.
+    """
+    image = np.asarray(image, np.float32)
+    if len(set(names)) < len(names) or not all(names):
+        raise ValueError(f"{path}: the layers need names that differ, got {list(names)}")
+    channels = image.shape[2] // max(len(names), 1) if image.ndim == 3 else 0
+    if channels not in (1, 3) or channels * len(names) != image.shape[2]:
+        raise ValueError(f"{path}: an image of shape {image.shape} does not consist of {len(names)} layers")
+    layers = {name: image[:, :, i * channels : (i + 1) * channels] for i, name in enumerate(names)}
+    write_exr(path, layers, {"layers": json.dumps(list(names)), **(metadata or {})})
+
+
+def read_layers(path: str | Path) -> tuple[np.ndarray, list[str]]:
+    """Read what `write_layers` wrote.
+
+    Returns
+    -------
+    image : (H, W, C K), float32.
+    names : of the K layers.
+
+    Raises
+    ------
+    ValueError : `write_layers` did not write this file.
+    OSError : as for `read_exr`.
+    """
+    layers, metadata = read_exr(path)
+    if "layers" not in metadata:
+        raise ValueError(f"{path}: the order of the layers is not stored in it")
+    names = json.loads(metadata["layers"])
+    return np.concatenate([layers[name] for name in names], axis=2), names
 
 
 def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -81,7 +81,7 @@ def _runs(runs: list[tuple[int, int, int]]) -> mi.UInt32:
     for first, step, count in runs:
         before, increment, n = joined[-1] if joined else (0, 0, 0)
         increment = first - before if n == 1 else increment
-        if n and first == before + increment * n and (count == 1 or step == increment):
+        if n and increment in (0, 1) and first == before + increment * n and (count == 1 or step == increment):
             joined[-1] = before, increment, n + count
         else:
             joined.append((first, step, count))

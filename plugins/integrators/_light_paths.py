@@ -39,8 +39,8 @@ class LightByLight(Scattering):
         self.several = list(lights.several.values())
 
     def direct(self, si, bsdf, light: mi.UInt32, sample: mi.Point2f | None, active) -> mi.Spectrum:
-        """Radiance of a light that `si` reflects without detours: mi.Spectrum, (N,). If not all lights are evaluated, it
-        also stands for the others."""
+        """Radiance of a light that `si` reflects without detours: mi.Spectrum, (N,). If not all lights are evaluated,
+        it stands for the others, too."""
         point = mi.Point2f(0.5)  # lights without an extent do not look at it
         if sample is not None:
             turned = sample + mi.Point2f(TURN) * mi.Float(light)
@@ -442,7 +442,7 @@ def _local(si: mi.SurfaceInteraction3f, which: Iterable[int]) -> tuple[mi.Surfac
 
 
 def _derivatives(values: list) -> list:
-    """Of what is attached, along the gradients of the parameters. Detached. All that shares a graph goes in one call."""
+    """Of what is attached, along the gradients of the parameters; detached. What shares a graph goes in one call."""
     found = dr.forward_to(values, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad) if values else []
     return [dr.detach(value) for value in found]
 

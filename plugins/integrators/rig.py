@@ -21,6 +21,88 @@ LONGEST = 16
 
 
 class RigIntegrator(EdgeIntegrator):
+    r"""
+    .. _integrator-rig:
+
+    Light by light (:monosp:`rig`)
+    ------------------------------
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path, in segments, as in ``path``: 1 shows emitters only, 2 adds direct illumination. From 0 to 16; a
+         derivative keeps all vertices of its paths in memory. (Default: 2)
+
+     * - rr_depth
+       - |int|
+       - From this depth on, paths end at random ("Russian roulette"). (Default: 5)
+
+     * - lights_per_path
+       - |int|
+       - Evaluate so many of the lights along each path, chosen at random, one from each of as many equal parts of their
+         list. What they contribute is scaled up, so that images stay right in the mean. (Default: 0, all)
+
+     * - sppc
+       - |int|
+       - Samples per pixel of the interior derivative. 0 switches it off; otherwise the ``spp`` argument of the render
+         call overrides it. Default: that argument, or the sampler's ``sample_count``.
+
+     * - sppp
+       - |int|
+       - Samples per pixel of the film boundary (visibility as seen from the sensor); likewise, but without a number
+         in the scene at most 16 (width + height) for each sample per pixel. Each sample sees all lights.
+
+     * - sppi
+       - |int|
+       - Samples per pixel of the shadows that the lights throw on what the camera sees; likewise. Each sample belongs
+         to one light.
+
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no)
+
+    Renders *one image for each light* of a scene, as photometric stereo and light stages take them, from one set of
+    camera paths. For K lights the image is of shape :monosp:`(H, W, 3 K)`, or :monosp:`(H, W, K)` in monochromatic
+    variants: the channels of the first light, then those of the second, and so on, in the order of the scene's
+    emitters; emitters of several lights (``distant_lights``, ``led``) have a layer for each of them. Layers are linear
+    radiance, whatever the pixel format of the film, and have no alpha channel. Their sum is what ``path`` renders, and
+    each is what ``path`` renders with that light alone. With lights that rays cannot hit and ``max_depth`` 2, the
+    random numbers are those of ``direct_edge``, and so are the images.
+
+    A path is traced once, and its vertices, their surfaces and their throughput are found once. At each vertex, a loop
+    runs over the lights, with one shadow ray for each whose light would be reflected.
+
+    **Interior.** As for ``prb_edge``: the first vertex is met by a ray that is fixed on the film, all further ones are
+    material points. A derivative in backward mode runs the loop over the lights once, too: what a vertex reflects of
+    them, weighed with their gradients, is a single spectrum, and the gradient of a surface is added up before it is
+    handed on.
+
+    **Boundaries.** On the film, both sides of an edge see all lights. Of the boundaries at shading points, the shadows
+    that lights throw on what the camera sees are found from the lights, hard and soft ones.
+
+    **Names.** :monosp:`integrator.light_names(scene)` lists the names of the layers, and
+    :monosp:`rimlight.edge_sampling.exr` has :monosp:`write_layers` and :monosp:`read_layers` for OpenEXR files with
+    named layers.
+
+    **Limits.** Those of ``prb_edge``. Shadows under an environment and all that edges do to indirect light are taken
+    not to move, with a warning, unless ``sppi`` is 0. Discs of ``distant_lights`` need ``hide_emitters`` and a scene
+    without perfect mirrors, since nobody knows which of them a ray hits. Spectral variants are not supported. Filters
+    other than ``box`` are right, and slower in proportion to the pixels that they cover.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="rig">
+                <integer name="max_depth" value="3"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'rig',
+            'max_depth': 3
+    """
+
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()
         limits = {"max_depth": (2, 0, LONGEST), "rr_depth": (5, 1, None), "lights_per_path": (0, 0, None)}

@@ -152,9 +152,10 @@ def measure(what: str, make: Callable[[np.ndarray], dict], settings: Settings, _
 
 
 def report(found: dict[str, Any]) -> list[str]:
-    lines = [f"{RES} × {RES} pixels, {SPP} samples per pixel, `max_depth` {DEPTH}, distant lights. **alone**: one light "
-             "after the other (three of them are measured, and multiplied). **memory**: the most that Dr.Jit held "
-             "during a call of `rig`."]  # fmt: skip
+    lines = [
+        f"{RES} × {RES} pixels, {SPP} samples per pixel, `max_depth` {DEPTH}, distant lights. **alone**: one light after "
+        f"the other ({PEERS} are measured, and multiplied). **memory**: the most that Dr.Jit held in a call of `rig`."
+    ]
     for name, case in found.items():
         what, lights = name.split("_", 1)
         kind = "one emitter `distant_lights`" if lights == "table" else "emitters `directional`"
