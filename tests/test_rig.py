@@ -35,7 +35,7 @@ LAMP = {"type": "point", "position": [1.5, 3, -2], "intensity": colour(9, 8, 7)}
 
 def panel() -> dict:
     to_world = mi.ScalarTransform4f().translate([-1, 4, -1]).rotate([1, 0, 0], 90).scale(0.7)
-    return {"type": "rectangle", "to_world": to_world, "emitter": {**cases.light(12, 11, 10), "id": "panel light"}}
+    return {"type": "rectangle", "to_world": to_world, "emitter": cases.light(12, 11, 10)}
 
 
 def small_lights() -> dict[str, dict]:
@@ -131,8 +131,9 @@ def test_layers_agree_with_path(options, rough):
     images = runs(rig(**options), room(lights, rough), range(16))
     path = mi.load_dict({"type": "path", **options})
     for name, light in lights.items():
-        expected = runs(path, room({name: light}, rough), range(100, 116))
-        i = names.index({"panel": "panel light"}.get(name, name))
+        dark = {} if name == "panel" else {"panel": {k: v for k, v in panel().items() if k != "emitter"}}
+        expected = runs(path, room({**dark, name: light}, rough), range(100, 116))
+        i = names.index(name)
         assert expected.any() == layer(images, i).any()
         if not expected.any():
             continue
@@ -191,7 +192,7 @@ def test_monochrome():
     try:
         film = cases.film(width=16, height=16, pixel_format="luminance")
         scene = room(small_lights(), film=film)
-        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "rig"}), spp=64, seed=1))
+        image = np.array(rig().render(scene, spp=64, seed=1))
         motion = Motion(scene, "cube.vertex_positions", direction=[1, 0.3, 0])
         J = np.array(derivative_image(scene, rig(max_depth=3), motion, spp=16, seed=3), np.float64)
         back = gradient(rig(max_depth=3), scene, motion, np.ones_like(J, np.float32))
@@ -199,7 +200,7 @@ def test_monochrome():
         mi.set_variant("llvm_ad_rgb")
     assert image.shape == (16, 16, 2)
     luminance = rgb.reshape(16, 16, 2, 3) @ np.float32([0.212671, 0.715160, 0.072169])
-    assert np.abs(image - luminance).sum() < 0.1 * luminance.sum()  # other spectra of the surfaces
+    np.testing.assert_allclose(image, luminance, atol=1e-4 * luminance.max())  # all surfaces are grey
     assert np.abs(J).sum() > 0
     assert back == pytest.approx(J.sum(), rel=1e-3)
 
@@ -300,7 +301,8 @@ def test_finite_differences(motion, step):
         z = z_scores(mean, error, reference.mean, reference.standard_error, reference.step_error)
         assert np.abs(reference.mean).sum() > 0
         assert np.abs(z).max() < 4.5
-        assert np.abs(mean - reference.mean).sum() < 0.03 * np.abs(reference.mean).sum()
+        noise = reference.standard_error + reference.step_error + error
+        assert np.abs(mean - reference.mean).sum() < 0.01 * np.abs(reference.mean).sum() + noise.sum()
 
 
 def test_terms_add_up():
@@ -377,10 +379,8 @@ def test_files_that_cannot_be_are_refused(tmp_path):
         read_layers(tmp_path / "b.exr")
 
 
-def test_names_differ():
-    scene = room({"a": panel(), "b": panel()})
-    names = rig().light_names(scene)
-    assert len(set(names)) == len(names) == 2
+def test_names_of_shapes_that_emit():
+    assert sorted(rig().light_names(room({"a": panel(), "b": panel(), "sun": SUN}))) == ["a", "b", "sun"]
 
 
 # ---------------------- Refusals ----------------------
@@ -403,7 +403,7 @@ def test_impossible_parameters_are_refused(options, message):
 
 
 def test_impossible_scenes_are_refused():
-    render = lambda lights, **options: mi.render(room(lights), integrator=rig(**options), spp=1)
+    render = lambda lights, **options: rig(**options).render(room(lights), spp=1)
     with pytest.raises(RuntimeError, match="the scene has no lights"):
         render({})
     with pytest.raises(RuntimeError, match='only 2 of "lights_per_path" 3 lights'):

@@ -214,12 +214,13 @@ class RigIntegrator(EdgeIntegrator):
     # ---------------------- Lights ----------------------
 
     def light_names(self, scene: mi.Scene) -> list[str]:
-        """A name for each layer, in their order: the identifier of the emitter, with a number if it consists of several
-        lights or if another has the same identifier."""
+        """A name for each layer, in their order: the identifier of the emitter, or of the shape that emits, with a
+        number if it consists of several lights or if another has the same."""
         names = []
         for e in scene.emitters():
-            several = hasattr(e, "light_count")
-            names += [f"{e.id()}{k:02d}" for k in range(e.light_count)] if several else [e.id()]
+            on_surface = e.flags() & mi.EmitterFlags.Surface and e.get_shape() is not None
+            name = e.get_shape().id() if on_surface else e.id()
+            names += [f"{name}{k:02d}" for k in range(e.light_count)] if hasattr(e, "light_count") else [name]
         return [n if names.count(n) == 1 else f"{n}_{names[:i].count(n)}" for i, n in enumerate(names)]
 
     def _lights(self, scene) -> Lights:
