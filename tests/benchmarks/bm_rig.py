@@ -153,7 +153,7 @@ def measure(what: str, make: Callable[[np.ndarray], dict], settings: Settings, _
 
 def report(found: dict[str, Any]) -> list[str]:
     lines = [
-        f"{RES} × {RES} pixels, {SPP} samples per pixel, `max_depth` {DEPTH}, distant lights. **alone**: one light after "
+        f"{RES} × {RES} pixels, {SPP} samples per pixel, `max_depth` {DEPTH}. **alone**: one light after "
         f"the other ({PEERS} are measured, and multiplied). **memory**: the most that Dr.Jit held in a call of `rig`."
     ]
     for name, case in found.items():
