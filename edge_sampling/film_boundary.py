@@ -197,7 +197,7 @@ class FilmBoundary:
                 weights.append(weight)
             if self.edges is not None:
                 active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, index, 0), p, rays))
-            outline = mi.Bool(True)
+            outline = dr.full(mi.Bool, True, count)
             if lights is not None:
                 outline = ~is_edge | self._jumps(projection, positions, dr.select(is_edge, index, 0))
             n_dl = dr.select(active, n_dl, 0)

@@ -86,6 +86,7 @@ class Place:
     u : mi.Point2f, position on the film, pixels.
     sample : mi.Point2f, random numbers for lights with an extent, or None.
     choice : mi.Float, which lights are evaluated; None for all.
+    beyond_horizon : mi.Bool, as for `EdgeIntegrator.sample`; None: nowhere.
     """
 
     number: int
@@ -97,13 +98,14 @@ class Place:
     u: mi.Point2f
     sample: mi.Point2f | None
     choice: mi.Float | None
+    beyond_horizon: mi.Bool | None = None
 
     @property
     def β(self) -> mi.Spectrum:
         """What light at this vertex is multiplied by."""
         return self.throughput * self.scale
 
-    def surface(self, scattering: Scattering, beyond_horizon: bool, active) -> mi.SurfaceInteraction3f:
+    def surface(self, scattering: Scattering, active) -> mi.SurfaceInteraction3f:
         """The surface there; attached, if `scattering` is, to a ray that is fixed on the film, and from the second
         vertex on to the material point."""
         follow = lambda number: mi.RayFlags.FollowShape if number > 1 else mi.RayFlags.Empty
@@ -115,8 +117,8 @@ class Place:
                 flags = mi.RayFlags.Minimal | follow(self.number - 1)
                 x = pi.compute_surface_interaction(ray, flags, active).p
                 si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
-        if beyond_horizon and self.number == 1:
-            up_to_horizon(si, self.ray)
+        if self.beyond_horizon is not None:
+            up_to_horizon(si, self.ray, self.beyond_horizon)
         return si
 
     def in_front(self, active: mi.Bool) -> tuple[Place, mi.Bool, mi.UInt32]:
@@ -137,7 +139,10 @@ class Place:
         at = lambda value: None if value is None else dr.gather(type(value), value, index, there)
         with dr.resume_grad():
             before = None if self.before is None else tuple(at(v) for v in self.before)
-            moved = {k: at(getattr(self, k)) for k in ("ray", "pi", "throughput", "scale", "u", "sample", "choice")}
+            moved = {
+                k: at(getattr(self, k))
+                for k in ("ray", "pi", "throughput", "scale", "u", "sample", "choice", "beyond_horizon")
+            }
         return replace(self, before=before, **moved), there, index
 
 
@@ -156,9 +161,9 @@ class Splat:
     def emission(self, light, value, place, active) -> None:
         self.layers.add(self.layers.footprint(place.u, active), light, place.β * value, active)
 
-    def direct(self, scattering, place, beyond_horizon, active) -> None:
+    def direct(self, scattering, place, active) -> None:
         place, active, _ = place.in_front(active)
-        si = place.surface(scattering, beyond_horizon, active)
+        si = place.surface(scattering, active)
         bsdf, at = si.bsdf(place.ray), self.layers.footprint(place.u, active)
 
         def step(light):
@@ -187,9 +192,9 @@ class Measure(Splat):
         δ = self.layers.at(self.layers.footprint(place.u, active), light, active)
         self.total += dr.select(active, dr.sum(δ * place.β * value), 0)
 
-    def direct(self, scattering, place, beyond_horizon, active) -> None:
+    def direct(self, scattering, place, active) -> None:
         place, active, index = place.in_front(active)
-        si = place.surface(scattering, beyond_horizon, active)
+        si = place.surface(scattering, active)
         bsdf, at = si.bsdf(place.ray), self.layers.footprint(place.u, active)
 
         def step(light, total):
@@ -223,11 +228,11 @@ class Forward:
             (derivative,) = _derivatives([value])
         self.layers.add(self.layers.footprint(place.u, active), light, place.β * derivative, active)
 
-    def direct(self, scattering, place, beyond_horizon, active) -> None:
+    def direct(self, scattering, place, active) -> None:
         before = _wide(self.tangent, active)
         place, active, index = place.in_front(active)
         tangent = dr.gather(mi.Spectrum, before, index, active)
-        si = place.surface(scattering, beyond_horizon, active)
+        si = place.surface(scattering, active)
         with dr.resume_grad():
             attached = _attached(si)
             which, derivatives = list(attached), _derivatives(list(attached.values()))
@@ -277,9 +282,9 @@ class Backward:
         with dr.resume_grad():
             self.emitted += dr.select(active, dr.sum(δ * value), 0)
 
-    def direct(self, scattering, place, beyond_horizon, active) -> None:
+    def direct(self, scattering, place, active) -> None:
         place, active, index = place.in_front(active)
-        si = place.surface(scattering, beyond_horizon, active)
+        si = place.surface(scattering, active)
         with dr.resume_grad():
             attached = _attached(si)
         bsdf, at = si.bsdf(place.ray), self.layers.footprint(place.u, active)
@@ -354,7 +359,7 @@ class LightPaths:
         scale: mi.Spectrum,
         choice: mi.Float | None = None,
         active: mi.Bool | bool = True,
-        beyond_horizon: bool = False,
+        beyond_horizon: mi.Bool | None = None,
     ) -> None:
         """Trace paths, and hand the light at their vertices over. Call it with gradients suspended.
 
@@ -363,7 +368,7 @@ class LightPaths:
         u : their positions on the film, pixels.
         scale : mi.Spectrum, (N,), what their radiance is multiplied by. Detached.
         choice : mi.Float, (N,), uniform; which lights are evaluated. None if all of them are.
-        beyond_horizon : as for `EdgeIntegrator.sample`.
+        beyond_horizon : mi.Bool, (N,), as for `EdgeIntegrator.sample`; None: nowhere.
         """
         scattering = LightByLight(self.scene, self.lights, self.per_path, attached=to.attached)
         area = scattering.any_hit_by_rays
@@ -373,9 +378,9 @@ class LightPaths:
         ray = to.start(ray)
         pi = self.first_hit(self.scene, ray, active)
         one, zero = (dr.full(mi.Spectrum, value, dr.width(u)) for value in (1, 0))
-        place = Place(1, ray, pi, None, one, scale + zero, u, None, choice)
+        place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, beyond_horizon)
         if area and not self.hide_emitters:
-            self._seen(to, scattering, place, beyond_horizon, active)
+            self._seen(to, scattering, place, active)
         active &= pi.is_valid()
         η = mi.Float(1)
         while self.depths.scatters(place.number):
@@ -383,25 +388,25 @@ class LightPaths:
             place = replace(place, throughput=_wide(place.throughput, active), sample=sample)
             sampler.schedule_state()
             dr.eval(place, active)
-            to.direct(scattering, place, beyond_horizon, active)
+            to.direct(scattering, place, active)
             if not (area or self.depths.scatters(place.number + 1)):
                 break
-            place, η, active = self._onwards(to, scattering, place, η, sampler, beyond_horizon, active)
+            place, η, active = self._onwards(to, scattering, place, η, sampler, active)
         dr.eval()
 
     # In functions of their own: forward mode must not meet what is left of earlier attached values.
 
-    def _seen(self, to, scattering, place, beyond_horizon, active) -> None:
+    def _seen(self, to, scattering, place, active) -> None:
         """What the first vertex emits."""
-        si = place.surface(scattering, beyond_horizon, active)
+        si = place.surface(scattering, active)
         emitter = si.emitter(self.scene)
         with dr.resume_grad(when=to.attached):
             value = emitter.eval(si, active)
         to.emission(scattering.number(emitter), value, place, active)
 
-    def _onwards(self, to, scattering, place, η, sampler, beyond_horizon, active) -> tuple[Place, mi.Float, mi.Bool]:
+    def _onwards(self, to, scattering, place, η, sampler, active) -> tuple[Place, mi.Float, mi.Bool]:
         """The next vertex, and what it emits."""
-        si = place.surface(scattering, beyond_horizon, active)
+        si = place.surface(scattering, active)
         emitted, onwards = scattering.sample_bsdf(si, si.bsdf(place.ray), sampler, active)
         light = None
         if scattering.any_hit_by_rays:
@@ -415,7 +420,7 @@ class LightPaths:
             weight = onwards.weight * dr.select(goes_on & (now != 0), after.β / now, 0)
         to.bounce(light, emitted, weight, place, active)
         before = (place.ray, place.pi) if to.attached else None
-        onto = {"ray": after.ray, "pi": after.pi, "before": before, "throughput": after.β}
+        onto = {"ray": after.ray, "pi": after.pi, "before": before, "throughput": after.β, "beyond_horizon": None}
         place = replace(place, number=after.depth, **onto)
         return place, after.η, goes_on
 

@@ -182,7 +182,7 @@ class RigIntegrator(EdgeIntegrator):
         sampler.set_sample_count(1)
         sampler.set_samples_per_wavefront(1)
         sampler.seed(seed, count)
-        points = boundary.points(sensor, sampler, count)
+        points = boundary.points(scene, sensor, sampler, count)
         with dr.resume_grad():
             normal_velocity = dr.dot(points.n_dl, points.velocity)
         weight = 1.0
@@ -194,7 +194,9 @@ class RigIntegrator(EdgeIntegrator):
         to = Splat(layers) if forward else Measure(layers)
         for sign, ray, ray_weight in zip((1, -1), points.rays, points.weights, strict=True):
             scale = ray_weight * (sign * weight)
-            paths.trace(to, sampler.clone(), ray, points.position, scale, choice, points.active, beyond_horizon=True)
+            paths.trace(
+                to, sampler.clone(), ray, points.position, scale, choice, points.active, beyond_horizon=points.outline
+            )
         if not forward:
             dr.eval(to.total, points.n_dl)
             with dr.resume_grad():

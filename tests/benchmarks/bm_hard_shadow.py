@@ -67,7 +67,7 @@ def many_lights(settings: Settings, _: Path) -> dict[str, Any]:
         lamp = {
             "type": "distant_lights",
             "directions": ", ".join(" ".join(f"{x:.6f}" for x in d) for d in directions),
-            "irradiance": f"{2 / count}",
+            "irradiance": 2 / count,
         }
         problem = Problem(
             f"{count} lights", cases.hard_shadow(lambda lamp=lamp: lamp)(), cases.SIDE, {OURS: METHODS[OURS]}
