@@ -86,7 +86,7 @@ class Place:
     u : mi.Point2f, position on the film, pixels.
     sample : mi.Point2f, random numbers for lights with an extent, or None.
     choice : mi.Float, which lights are evaluated; None for all.
-    beyond_horizon : mi.Bool, as for `EdgeIntegrator.sample`; None: nowhere.
+    outline : mi.Bool, do normals of the first vertex turn back to the horizon? None: nowhere.
     """
 
     number: int
@@ -98,7 +98,7 @@ class Place:
     u: mi.Point2f
     sample: mi.Point2f | None
     choice: mi.Float | None
-    beyond_horizon: mi.Bool | None = None
+    outline: mi.Bool | None
 
     @property
     def β(self) -> mi.Spectrum:
@@ -117,8 +117,8 @@ class Place:
                 flags = mi.RayFlags.Minimal | follow(self.number - 1)
                 x = pi.compute_surface_interaction(ray, flags, active).p
                 si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
-        if self.beyond_horizon is not None:
-            up_to_horizon(si, self.ray, self.beyond_horizon)
+        if self.outline is not None and self.number == 1:
+            up_to_horizon(si, self.ray, self.outline)
         return si
 
     def in_front(self, active: mi.Bool) -> tuple[Place, mi.Bool, mi.UInt32]:
@@ -141,7 +141,7 @@ class Place:
             before = None if self.before is None else tuple(at(v) for v in self.before)
             moved = {
                 k: at(getattr(self, k))
-                for k in ("ray", "pi", "throughput", "scale", "u", "sample", "choice", "beyond_horizon")
+                for k in ("ray", "pi", "throughput", "scale", "u", "sample", "choice", "outline")
             }
         return replace(self, before=before, **moved), there, index
 
@@ -359,7 +359,7 @@ class LightPaths:
         scale: mi.Spectrum,
         choice: mi.Float | None = None,
         active: mi.Bool | bool = True,
-        beyond_horizon: mi.Bool | None = None,
+        outline: mi.Bool | None = None,
     ) -> None:
         """Trace paths, and hand the light at their vertices over. Call it with gradients suspended.
 
@@ -368,7 +368,7 @@ class LightPaths:
         u : their positions on the film, pixels.
         scale : mi.Spectrum, (N,), what their radiance is multiplied by. Detached.
         choice : mi.Float, (N,), uniform; which lights are evaluated. None if all of them are.
-        beyond_horizon : mi.Bool, (N,), as for `EdgeIntegrator.sample`; None: nowhere.
+        outline : mi.Bool, (N,), where to turn normals back to the horizon, see `up_to_horizon`. None: nowhere.
         """
         scattering = LightByLight(self.scene, self.lights, self.per_path, attached=to.attached)
         area = scattering.any_hit_by_rays
@@ -378,7 +378,7 @@ class LightPaths:
         ray = to.start(ray)
         pi = self.first_hit(self.scene, ray, active)
         one, zero = (dr.full(mi.Spectrum, value, dr.width(u)) for value in (1, 0))
-        place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, beyond_horizon)
+        place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, outline)
         if area and not self.hide_emitters:
             self._seen(to, scattering, place, active)
         active &= pi.is_valid()
@@ -420,7 +420,7 @@ class LightPaths:
             weight = onwards.weight * dr.select(goes_on & (now != 0), after.β / now, 0)
         to.bounce(light, emitted, weight, place, active)
         before = (place.ray, place.pi) if to.attached else None
-        onto = {"ray": after.ray, "pi": after.pi, "before": before, "throughput": after.β, "beyond_horizon": None}
+        onto = {"ray": after.ray, "pi": after.pi, "before": before, "throughput": after.β}
         place = replace(place, number=after.depth, **onto)
         return place, after.η, goes_on
 

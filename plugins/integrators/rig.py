@@ -192,11 +192,10 @@ class RigIntegrator(EdgeIntegrator):
             weight = dr.detach(weight)
         choice = self._choice(sampler, seed)
         to = Splat(layers) if forward else Measure(layers)
+        outline = points.outline | dr.full(mi.Bool, False, count)
         for sign, ray, ray_weight in zip((1, -1), points.rays, points.weights, strict=True):
             scale = ray_weight * (sign * weight)
-            paths.trace(
-                to, sampler.clone(), ray, points.position, scale, choice, points.active, beyond_horizon=points.outline
-            )
+            paths.trace(to, sampler.clone(), ray, points.position, scale, choice, points.active, outline)
         if not forward:
             dr.eval(to.total, points.n_dl)
             with dr.resume_grad():
