@@ -1,5 +1,6 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
+from .batch import Batch, FilmPart, film_parts
 from .edge_importance import Cone, EdgeSample, Lobe, View, resample, sample_edge, stratified
 from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, find_edges
@@ -16,6 +17,7 @@ from .silhouettes import Silhouettes
 from .zscores import mean_and_error, z_scores
 
 __all__ = [
+    "Batch",
     "BoundarySamples",
     "Cone",
     "EdgeKind",
@@ -23,6 +25,7 @@ __all__ = [
     "EdgeTree",
     "Edges",
     "FilmBoundary",
+    "FilmPart",
     "FiniteDifferences",
     "Geometry",
     "Lights",
@@ -35,6 +38,7 @@ __all__ = [
     "Silhouettes",
     "View",
     "derivative_image",
+    "film_parts",
     "find_edges",
     "finite_differences",
     "has_hard_beam",

@@ -25,7 +25,7 @@ from .device_edges import DeviceEdges
 from .edges import Edges
 from .lights import Lights
 from .meshes import Geometry
-from .projection import FilmPoint, Projection, frame, inside_frame, tangent
+from .projection import Projection, inside_frame
 
 #: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
 #: an edge that cannot be seen changes nothing, not even the last bit.
@@ -108,7 +108,7 @@ class FilmBoundary:
         """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
 
         Edges are chosen in proportion to their length on the film, and points uniformly along them, both by one
-        stratified number.
+        stratified number. Where edges are curves on the film, angles from the eye stand for lengths.
 
         sampler : seeded for `count` lanes.
         radiance : maps (rays, sampler, active, outline) to (L, alpha), detached; `outline`: does the ray pass a
@@ -146,20 +146,20 @@ class FilmBoundary:
             # silhouettes as seen from a light: that is a jump, too, if the light has no size.
             smooth = self.edges is not None and self.edges.any_smooth
             lights = self.lights.places(scene) if smooth else None
-            lengths = self._visible_lengths(projection, positions, frames, lights, sensor.film())
+            lengths = self._visible_lengths(projection, positions, frames, lights)
             index, along, density = self._choose(lengths, sampler, count)
             is_edge, is_line = index < self.counts[0], index < sum(self.counts[:2])
             along_film, valid = mi.Vector2f(0), mi.Bool(False)
             if self.edges is not None:
                 a, b = self._end_points(projection, positions, index)
-                visible = _clip(projection, projection.film(a), projection.film(b), sensor.film())
+                visible = projection.clip(a, b)
                 t, dt = visible.parameter(along)
-                along_film, valid = tangent(projection, a, b, t, aperture_sample) * dt, is_line & (visible.length > 0)
+                along_film, valid = projection.tangent(a, b, t, aperture_sample) * dt, is_line & (visible.length > 0)
             if self.curves is not None:
                 eye = -projection.view() if projection.orthographic else projection.eye(aperture_sample)
                 piece = dr.select(is_line, 0, index - sum(self.counts[:2]))
                 c = self.curves.point(frames, piece, along, eye, projection.orthographic)
-                on_film = tangent(projection, c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), aperture_sample)
+                on_film = projection.tangent(c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), aperture_sample)
                 along_film = dr.select(is_line, along_film, on_film)
                 valid |= ~is_line & c.valid & (projection.film(c.p).z > projection.near)
 
@@ -241,7 +241,6 @@ class FilmBoundary:
         positions: mi.Float,
         frames: mi.Float | None,
         lights: mi.Vector4f | None,
-        film: mi.Film,
     ) -> mi.Float:
         """Length inside the frame of each edge, cut and piece of a curve, 0 where nothing can jump: pixels on the film;
         of curves, an estimate."""
@@ -252,17 +251,17 @@ class FilmBoundary:
             if lights is not None:
                 jumps |= self.edges.is_silhouette_of_any(positions, edge, lights)
             for a, b in (self.edges.end_points(positions, edge), self._cut(projection, positions, face)):
-                lengths.append(_clip(projection, projection.film(a), projection.film(b), film).length)
+                lengths.append(projection.clip(a, b).length)
             lengths[0] = dr.select(jumps, lengths[0], 0)
         if self.curves is not None:
-            lengths.append(self._curve_length(projection, frames, film))
+            lengths.append(self._curve_length(projection, frames))
         return dr.concat(lengths) if len(lengths) > 1 else lengths[0]
 
-    def _curve_length(self, projection: Projection, frames: mi.Float, film: mi.Film) -> mi.Float:
+    def _curve_length(self, projection: Projection, frames: mi.Float) -> mi.Float:
         """About the length of each piece of a curve, 0 only where it is certainly out of the frame."""
         piece = dr.arange(mi.UInt32, self.counts[2])
         eye = -projection.view() if projection.orthographic else projection.eye()
-        lower, upper = frame(film)
+        lower, upper = projection.frame
         points = [
             projection.film(self.curves.point(frames, piece, mi.Float(t), eye, projection.orthographic).p)
             for t in (0, 0.5, 1)
@@ -294,7 +293,7 @@ class FilmBoundary:
     def _cut(self, projection: Projection, positions: mi.Float, face: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
         """End points of the cut of the near clipping plane through faces; NaN where there is none. World space."""
         corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, corner, face)) for corner in self.corners]
-        depth = [(projection.to_local @ p).z - projection.near for p in corners]
+        depth = [projection.film(p).z - projection.near for p in corners]
         # The corner that has the plane between itself and the two others, first.
         front = [d > 0 for d in depth]
         for k in (1, 2):
@@ -315,41 +314,3 @@ class FilmBoundary:
         in_world = 8 * ulp * largest * projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film
-
-
-@dataclass(frozen=True)
-class _Segment:
-    """The visible part of an edge: interval of its parameter, depths at its ends, length on the film in pixels."""
-
-    start: mi.Float
-    end: mi.Float
-    w_start: mi.Float
-    w_end: mi.Float
-    length: mi.Float
-
-    def parameter(self, s: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Edge parameter t that lies a fraction s along the segment *as seen on the film*, and dt/ds."""
-        d = dr.lerp(self.w_end, self.w_start, s)
-        extent = self.end - self.start
-        return self.start + extent * s * self.w_start / d, extent * self.w_start * self.w_end / dr.square(d)
-
-
-def _clip(projection: Projection, a: FilmPoint, b: FilmPoint, film: mi.Film) -> _Segment:
-    """Clip edges to near and far planes and to the frame plus the blur of the lens (Liang and Barsky 1984)."""
-    lower, upper = frame(film)
-    blur_a, blur_b = projection.blur(a), projection.blur(b)
-    start, end = mi.Float(0), mi.Float(1)
-    near, far = projection.near * (1 - 1e-4), projection.far  # cuts lie on the near plane, but for rounding
-    planes = [(a.z - near, b.z - near), (far - a.z, far - b.z)]
-    for i in (0, 1):
-        planes.append((a.xy[i] - lower[i] * a.w + blur_a, b.xy[i] - lower[i] * b.w + blur_b))
-        planes.append((upper[i] * a.w - a.xy[i] + blur_a, upper[i] * b.w - b.xy[i] + blur_b))
-    for at_a, at_b in planes:
-        crossing = at_a / (at_a - at_b)
-        start = dr.select(at_a < 0, dr.select(at_b < 0, 1, dr.maximum(start, crossing)), start)
-        end = dr.select(at_b < 0, dr.select(at_a < 0, 0, dr.minimum(end, crossing)), end)
-    at = lambda t: FilmPoint(dr.lerp(a.xy, b.xy, t), dr.lerp(a.w, b.w, t), dr.lerp(a.z, b.z, t))
-    p, q = at(start), at(end)
-    length = dr.select(start < end, dr.norm(q.position() - p.position()), 0)
-    # Written so that NaN, as from vertices that are not finite, counts as invisible.
-    return _Segment(start, end, p.w, q.w, dr.select((length > 0) & dr.isfinite(length), length, 0))

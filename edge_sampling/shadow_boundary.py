@@ -24,7 +24,7 @@ import mitsuba as mi
 from .device_edges import beside_edge
 from .edge_importance import View, power_heuristic
 from .lights import Lights
-from .projection import Projection, inside_frame, tangent
+from .projection import Projection, inside_frame
 from .silhouettes import Silhouettes
 
 
@@ -209,7 +209,7 @@ class ShadowBoundary:
                 """How the shadow moves on the film if p does by v."""
                 s = dr.select(far, 1, dr.dot(facing, x + facing * lift - y) / dr.dot(facing, d))
                 v = s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))
-                return dr.detach(tangent(projection, x, mi.Point3f(x + v), mi.Float(0), aperture_sample))
+                return dr.detach(projection.tangent(x, mi.Point3f(x + v), mi.Float(0), aperture_sample))
 
             T, towards_light = on_receiver(outline.tangent), on_receiver(lit)
             n_dl = mi.Vector2f(-T.y, T.x) / (e.density * density * (count / len(self)))

@@ -259,11 +259,11 @@ def torus_in_the_sun() -> mi.Scene:
     return scene(sensor=camera(), torus=torus(bsdf=diffuse(0.5)), lamp=sun())
 
 
-def near_plane() -> mi.Scene:
+def near_plane(sensor: Callable[..., dict] = camera) -> Callable[[], mi.Scene]:
     """A long floor that passes under the camera and ends behind it."""
     quad = [[-1.2, 0, -9], [1.5, 0, -9], [-1.2, 0, 6], [1.5, 0, 6]]
-    return scene(
-        sensor=camera((0, 1, -5), (0, 0.4, 0)),
+    return lambda: scene(
+        sensor=sensor((0, 1, -5), (0, 0.4, 0)),
         floor=mesh("floor", quad, [[0, 2, 1], [1, 2, 3]], bsdf=diffuse(0.5)),
         environment=constant(),
     )
@@ -313,6 +313,16 @@ def shadow_blocker(
 
 def lens_over_blocker(origin, target) -> dict:
     return camera(origin, target, "thinlens", aperture_radius=0.15, focus_distance=4.5)
+
+
+def parallel_over_blocker(origin, target) -> dict:
+    """To the side, lest the floor end where the frame does."""
+    return camera(np.add(origin, [0.3, 0, 0]), np.add(target, [0.3, 0, 0]), "orthographic")
+
+
+def fisheye_over_blocker(origin, target) -> dict:
+    """Closer, and with the shadow between centre and rim."""
+    return fisheye(np.add(target, [0.5, 1.2, -1.5]), np.add(target, [1, 1, 1]))
 
 
 def conductor(alpha: float) -> dict:
@@ -548,8 +558,11 @@ CAMERA_X = {"key": "sensor.to_world", "direction": [1, 0, 0]}
 CAMERA_UP = {"key": "sensor.to_world", "direction": [0, 1, 0]}
 UP = {"key": "torus.vertex_positions", "direction": [0, 1, 0]}
 CAMERA_Z = {"key": "sensor.to_world", "direction": [0, 0, 1]}
+ALONG = {"key": "sensor.to_world", "direction": [0.3, 1, 0.2]}
+LEFT_CAMERA = {**ALONG, "key": "sensor.left.to_world"}
 CAMERA_TURN = {"key": "sensor.to_world", "rotate": [0, 1, 0.2]}
 FIELD_OF_VIEW = {"key": "sensor.x_fov", "direction": [1]}
+FISHEYE_FIELD_OF_VIEW = {"key": "sensor.fov", "direction": [1]}
 PRINCIPAL_POINT_X = {"key": "sensor.principal_point_offset_x", "direction": [1]}
 PRINCIPAL_POINT_Y = {"key": "sensor.principal_point_offset_y", "direction": [1]}
 FLOOR_TURN = {"key": "floor.to_world", "rotate": [1, 0, 0]}
@@ -584,6 +597,42 @@ def orthographic() -> dict:
 
 def thin_lens() -> dict:
     return camera(kind="thinlens", aperture_radius=0.3, focus_distance=4.0)
+
+
+def fisheye(origin=(2.2, 0.4, 0.6), target=(0.6, -0.5, 5), **options: Any) -> dict:
+    """At `cube`, across the rim of its image circle: it is beside it, partly behind."""
+    return camera(origin, target, kind="fisheye", **{"fov": 180, **options})
+
+
+def fisheye_crop() -> dict:
+    return fisheye(fov_axis="diagonal", film={**film("gaussian"), **CROP, "crop_offset_x": 32})
+
+
+def all_around(origin, target) -> dict:
+    """The whole sphere of directions."""
+    return fisheye(origin, target, fov=360)
+
+
+def batch(origin=(1.5, 2, -5), target=(0, 0, 0), right=camera, **options: Any) -> dict:
+    """Two views side by side: from `origin`, and from somewhere to the left of it."""
+    aside = np.add(origin, [-1.5, 0.3, 0.5])
+    options = {"width": 2 * RES, **options}
+    return {
+        "type": "batch",
+        "left": camera(origin, target),
+        "right": right(aside, np.add(target, [-0.2, 0, 0])),
+        "film": film(**options),
+    }
+
+
+def batch_with_fisheye() -> dict:
+    """One of each kind."""
+    return batch(right=lambda *pose: fisheye(*pose, fov=70))
+
+
+def batch_crop() -> dict:
+    """Each view is stretched to its half of the crop window."""
+    return batch(**{**CROP, "height": RES, "crop_width": 40, "crop_height": 24}, rfilter="gaussian")
 
 
 def close_up() -> dict:
@@ -626,6 +675,15 @@ CASES = [
     Case("thin_lens_cube", cube(thin_lens), SIDE, 1e-2, tolerance=0.02, spp=1024),
     Case("thin_lens_camera", cube(thin_lens), CAMERA_Z, 2e-2, tolerance=0.02, spp=1024),
     Case("thin_lens_focus", cube(thin_lens), FOCUS, 4e-2, tolerance=0.04),
+    Case("fisheye_cube", cube(fisheye, textured_cube), SIDE, 6e-3, spp=1024),
+    Case("fisheye_camera", cube(fisheye, textured_cube), ALONG, 6e-3, spp=1024),
+    Case("fisheye_camera_rotation", cube(fisheye, textured_cube), CAMERA_TURN, 3e-3, spp=1024),
+    Case("fisheye_field_of_view", cube(fisheye, textured_cube), FISHEYE_FIELD_OF_VIEW, 0.3, spp=1024),
+    Case("fisheye_crop_window", cube(fisheye_crop, textured_cube), ALONG, 4e-3, spp=1024),
+    Case("fisheye_all_around", near_plane(all_around), ALONG, 8e-3, 0.02, spp=1024, runs=24),
+    Case("batch_cube", cube(batch_with_fisheye, textured_cube), SIDE, 6e-3, spp=1024),
+    Case("batch_camera", cube(batch, textured_cube), LEFT_CAMERA, 6e-3, spp=1024),
+    Case("batch_crop_window", cube(batch_crop, textured_cube), SIDE, 6e-3, spp=1024),
     Case("gaussian_filter", filtered("gaussian"), SIDE, 6e-3),
     Case("tent_filter", filtered("tent"), SIDE, 6e-3),
     Case("mitchell_filter", filtered("mitchell"), SIDE, 6e-3),
@@ -633,8 +691,8 @@ CASES = [
     Case("crop_window", crop(), SIDE, 4e-3),
     Case("crop_window_camera", crop("gaussian"), PRINCIPAL_POINT_X, 1e-3),
     Case("leaving_the_frame", cube(close_up), SIDE, 4e-3, spp=1024, runs=36),
-    Case("near_plane", near_plane, {"key": "floor.vertex_positions", "direction": [0.3, 1, 0]}, 2e-3),
-    Case("near_plane_camera", near_plane, {"key": "sensor.to_world", "direction": [0.3, 1, 0.2]}, 2e-3),
+    Case("near_plane", near_plane(), {"key": "floor.vertex_positions", "direction": [0.3, 1, 0]}, 2e-3),
+    Case("near_plane_camera", near_plane(), ALONG, 2e-3),
     Case("near_plane_cut", cube(cut_open), SIDE, 4e-3),
     Case("near_plane_cut_camera", cube(cut_open), {"key": "sensor.to_world", "rotate": [0.3, 1, 0.3]}, 8e-4),
     Case("smooth_torus", smooth_torus(), UP, 6e-3, tolerance=0.04, spp=1024, largest_z=7),
@@ -654,6 +712,13 @@ CASES = [
     Case("shadow_light", shadow_blocker(), LIGHT_SIDE, 2e-2, 0.03, spp=1024, runs=24),
     Case("shadow_floor", shadow_blocker(), FLOOR_UP, 6e-3, 0.03, spp=1024, runs=24),
     Case("shadow_thin_lens", shadow_blocker(lens_over_blocker), BLOCKER_UP, 3e-2, 0.03, spp=1024, runs=40),
+    Case("shadow_thin_lens_camera", shadow_blocker(lens_over_blocker), INTO_THE_SCREEN, 3e-2, 0.03, spp=1024, runs=40),
+    Case("shadow_orthographic", shadow_blocker(parallel_over_blocker), BLOCKER_UP, 3e-2, 0.02, spp=1024, runs=24),
+    Case("shadow_orthographic_camera", shadow_blocker(parallel_over_blocker), ALONG, 1e-2, 0.02, spp=1024, runs=24),
+    Case("shadow_fisheye", shadow_blocker(fisheye_over_blocker), BLOCKER_UP, 1e-2, 0.02, spp=1024, runs=40),
+    Case("shadow_fisheye_camera", shadow_blocker(fisheye_over_blocker), ALONG, 6e-3, 0.02, spp=1024, runs=24),
+    Case("shadow_batch", shadow_blocker(batch), BLOCKER_UP, 2.5e-2, 0.02, spp=1024, runs=24, reference_spp=4096),
+    Case("shadow_batch_camera", shadow_blocker(batch), LEFT_CAMERA, 1e-2, 0.02, spp=1024, runs=24, reference_spp=4096),
     Case("glossy_receiver", glossy_receiver(0.01), BLOCKER_SIDE, 8e-3, 0.03, spp=1024, runs=40),
     Case("mirror_receiver", glossy_receiver(5e-4), BLOCKER_SIDE, 5e-3, 0.03, spp=1024, runs=24, noisy=True),
     # Zero, but for the floor's outline.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import shlex
 import subprocess
@@ -10,6 +11,7 @@ import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
+import mitsuba as mi
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -78,6 +80,16 @@ def test_snippets_run(page, tmp_path):
     script.write_text(program(page, blocks(read(page))), encoding="utf-8")
     result = subprocess.run([sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, timeout=240)
     assert result.returncode == 0, result.stderr[-3000:]
+
+
+@pytest.mark.parametrize("name", [p.stem for p in sorted((ROOT / "docs" / "plugins").glob("*.rst"))])
+def test_tabs_of_manual_pages_load(name):
+    """The XML and the Python of a plugin's page make objects of the same type."""
+    page = inspect.getdoc(type(mi.load_dict({"type": name})))
+    tabs = dict(re.findall(r"\.\. code-tab:: (\w+)\n\n(.*?)(?=\n *\.\. code-tab|\Z)", page, re.DOTALL))
+    python = mi.load_dict(eval(f"{{{textwrap.dedent(tabs['python'])}}}", {"mi": mi}))
+    xml = mi.load_string(tabs["xml"].strip().replace(">", ' version="3.0.0">', 1))
+    assert type(python) is type(xml) is type(mi.load_dict({"type": name}))
 
 
 @pytest.mark.parametrize("line", COMMANDS)

@@ -77,6 +77,9 @@ VALUES = [
     ("room", "light.to_world"),
     ("room", "sensor.to_world"),
     ("room", "light.emitter.radiance.value"),
+    ("fisheye", "sensor.to_world"),
+    ("fisheye", "sensor.fov"),
+    ("batch", "sensor.left.to_world"),
     ("cube", "cube.vertex_positions"),  # with normals, under a sky: no light has a surface
     ("spot", "cube.vertex_positions"),
     ("spot", "lamp.to_world"),
@@ -90,6 +93,8 @@ SCENES = {
     "spot": cases.hard_shadow(lambda: {**cases.spot(), "intensity": 100.0}),
     "sphere": cases.sphere_over(cases.sun, cases.ceiling_light),
     "torus": cases.torus_in_the_sun,
+    "fisheye": cases.room(cases.fisheye),
+    "batch": cases.room(cases.batch),
 }
 
 

@@ -1,4 +1,6 @@
-"""`Projection` inverts `Sensor.sample_ray`, for every sensor and film."""
+"""`Projection` inverts `Sensor.sample_ray`, for every sensor and film, and finds what is visible of an edge."""
+
+from __future__ import annotations
 
 import cases
 import drjit as dr
@@ -15,6 +17,8 @@ SENSORS = {
     "perspective, y axis": {"fov_axis": "y"},
     "thinlens": {"kind": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
     "orthographic": {"kind": "orthographic"},
+    "fisheye": {"kind": "fisheye", "fov": 180},
+    "fisheye, diagonal": {"kind": "fisheye", "fov": 355, "fov_axis": "diagonal"},
 }
 
 
@@ -32,19 +36,97 @@ def test_inverts_sample_ray(options, film):
     assert np.abs(np.array(u - expected)).max() < 2e-3
 
 
-def test_follows_every_parameter_of_the_camera():
-    sensor = mi.load_dict(cases.camera(kind="thinlens", aperture_radius=0.3, focus_distance=4.0))
-    for key in ("x_fov", "to_world", "aperture_radius", "focus_distance"):
-        params = mi.traverse(sensor)
-        assert not Projection(sensor).attached
-        dr.enable_grad(params[key])
-        params.update()
-        projection = Projection(sensor)
-        assert projection.attached
-        u = projection.film(mi.Point3f(0.1, 0.2, 0.3), mi.Point2f(0.2, 0.9)).position()
-        assert dr.grad_enabled(u)
-        dr.disable_grad(params[key])
-        params.update()
+LENS = {"kind": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0}
+PARAMETERS = [(LENS, key) for key in ("x_fov", "to_world", "aperture_radius", "focus_distance")]
+PARAMETERS += [({"kind": "fisheye"}, key) for key in ("fov", "to_world")]
+
+
+@pytest.mark.parametrize(("options", "key"), PARAMETERS)
+def test_follows_every_parameter_of_the_camera(options, key):
+    sensor = mi.load_dict(cases.camera(**options))
+    params = mi.traverse(sensor)
+    assert not Projection(sensor).attached
+    dr.enable_grad(params[key])
+    params.update()
+    projection = Projection(sensor)
+    assert projection.attached
+    u = projection.film(mi.Point3f(0.1, 0.2, 0.3), mi.Point2f(0.2, 0.9)).position()
+    assert dr.grad_enabled(u)
+
+
+# ---------------------- Edges ----------------------
+
+COUNT, POINTS = 2000, 64
+EDGES = {
+    **SENSORS,
+    "fisheye, all around": {"kind": "fisheye", "fov": 360},
+    "fisheye, wide": {"kind": "fisheye", "fov": 230},
+    "fisheye, narrow": {"kind": "fisheye", "fov": 30},
+}
+
+
+def edges() -> tuple[mi.Point3f, mi.Point3f]:
+    """Of all lengths, on all sides of the camera, and close to it."""
+    rng = np.random.default_rng(0)
+    centre = rng.normal(size=(3, COUNT)) * rng.uniform(0.3, 6, COUNT) + [[1.5], [2], [-5]]
+    half = rng.normal(size=(3, COUNT)) * 10 ** rng.uniform(-3, 1, COUNT)
+    return mi.Point3f(centre - half), mi.Point3f(centre + half)
+
+
+def fractions() -> mi.Float:
+    """For all edges after each other, numbers in (0, 1)."""
+    return (mi.Float(dr.arange(mi.UInt32, COUNT * POINTS) % POINTS) + 0.5) / POINTS
+
+
+def repeated(value):
+    return dr.gather(type(value), value, dr.arange(mi.UInt32, COUNT * POINTS) // POINTS)
+
+
+@pytest.mark.parametrize("film", [{}, CROP], ids=["whole", "crop"])
+@pytest.mark.parametrize("options", EDGES.values(), ids=EDGES.keys())
+def test_what_the_sensor_sees_of_an_edge_is_sampled(options, film):
+    """Each visible point lies within the part of its edge that `clip` finds."""
+    sensor = mi.load_dict(cases.camera(film={**cases.film(), **film}, **options))
+    projection = Projection(sensor)
+    a, b = edges()
+    part = projection.clip(a, b)
+    (first, _), (last, _) = part.parameter(mi.Float(0)), part.parameter(mi.Float(1))
+    first, last, length = repeated(first), repeated(last), repeated(part.length)
+    t = fractions()
+    point = projection.film(dr.lerp(repeated(a), repeated(b), t))
+    u, fov = np.array(point.position()), options.get("fov", 360)
+    lower, upper = np.array(projection.frame)
+    visible = ((u > lower[:, None] + 1e-2) & (u < upper[:, None] - 1e-2)).all(0)
+    visible &= (np.array(point.z) > projection.near * 1.01) & (np.array(point.z) < projection.far)
+    if options.get("kind") == "fisheye":
+        radius = sensor.circle_radius()
+        visible &= np.hypot(*(u - np.array(sensor.film().size())[:, None] / 2)) < radius - 1e-2
+        # Twice around, the way back would be there as well.
+        assert fov == 360 or np.array(length).max() < 1.01 * 2 * radius * 360 / fov
+    assert visible.sum() > 100
+    assert (np.array(length) > 0)[visible].all()
+    assert (np.array(t >= first - 1e-4) & np.array(t <= last + 1e-4))[visible].all()
+
+
+@pytest.mark.parametrize("options", EDGES.values(), ids=EDGES.keys())
+def test_tangents_and_parameters_are_derivatives(options):
+    """Of the film position by t, and of t by the fraction of the visible part: against automatic differentiation."""
+    projection = Projection(mi.load_dict(cases.camera(**options)))
+    a, b = edges()
+    part = projection.clip(a, b)
+    good = part.length > 1e-2
+    s = mi.Float(0.4)
+    dr.enable_grad(s)
+    t, dt = part.parameter(s)
+    u = projection.film(dr.lerp(a, b, t), mi.Point2f(0.3, 0.8)).position()
+    dr.forward(s, dr.ADFlag.ClearEdges)
+    expected, got = np.array(dr.grad(t)), np.array(dr.detach(dt))
+    good = np.array(good) & (np.abs(expected) > 1e-6)
+    assert good.sum() > 20
+    np.testing.assert_allclose(got[good], expected[good], rtol=2e-2)
+    tangent = np.array(dr.detach(projection.tangent(a, b, dr.detach(t), mi.Point2f(0.3, 0.8)) * dt))
+    difference = np.linalg.norm(tangent - np.array(dr.grad(u)), axis=0)
+    assert (difference <= 2e-2 * np.linalg.norm(tangent, axis=0))[good].all()
 
 
 def test_unknown_sensor_is_refused():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -12,13 +13,16 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from rimlight._plan import Plan, PlannedTerm, names
 from rimlight.edge_sampling import (
+    Batch,
     Edges,
     FilmBoundary,
+    FilmPart,
     Geometry,
     Lights,
     ShadingBoundary,
     ShadowBoundary,
     Silhouettes,
+    film_parts,
     find_edges,
     has_hard_beam,
     intersecting_meshes,
@@ -302,16 +306,24 @@ class EdgeIntegrator(ADIntegrator):
         # samples of boundaries, of weight zero, are normalised as the image is, for every filter.
         sampler, weights = self._sampler(sensor, seed, sppc or 16)
         terms = [lambda: self._interior(scene, sensor, sampler, weights, mode, sppc > 0)]
+        parts = [(part, seed ^ i << 16) for i, part in enumerate(film_parts(sensor))]
         if boundaries.film is not None and sppp > 0:
-            terms.append(lambda: self._film_boundary(scene, sensor, seed, sppp, weights, boundaries.film))
+            terms += [
+                partial(self._film_boundary, scene, sensor, *part, sppp, weights, boundaries.film) for part in parts
+            ]
         if boundaries.silhouettes is not None:
             boundaries.silhouettes.refit()
         if boundaries.shadows is not None:
-            terms.append(lambda: self._shadows(scene, sensor, seed, sppi, weights, boundaries))
+            terms += [partial(self._shadows, scene, sensor, *part, sppi, weights, boundaries) for part in parts]
         if boundaries.shading is not None:
             boundaries.shading.refit()
             terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, mode, boundaries.shading))
         return sensor.film(), terms
+
+    def sample_rays(self, scene, sensor, sampler):
+        """Camera rays, their weights, and film positions in pixels, as Mitsuba has it."""
+        batch = sensor.class_name() == "BatchSensor"
+        return super().sample_rays(scene, Batch(sensor) if batch else sensor, sampler)
 
     def _interior(self, scene, sensor, sampler, weights, mode, wanted: bool) -> Term:
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
@@ -323,26 +335,27 @@ class EdgeIntegrator(ADIntegrator):
             value = Sample(mi.Spectrum(L * ray_weight), mi.Float(0))
         return Term(position, value, ray.wavelengths, 1.0, weights, replay, dr.detach(ray_weight), rays)
 
-    def _film_boundary(self, scene, sensor, seed, sppp, weights, boundary: FilmBoundary) -> Term:
-        """Visibility as seen from the sensor."""
-        count = self._line_samples(sensor, sppp)
+    def _film_boundary(self, scene, sensor, part: FilmPart, seed, sppp, weights, boundary: FilmBoundary) -> Term:
+        """Visibility as seen from the sensor, on one part of its film."""
+        count = self._line_samples(part.sensor, sppp)
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(1)
         sampler.set_samples_per_wavefront(1)
         sampler.seed(0xFFFFFFFF ^ seed, count)
-        s = boundary.sample(scene, sensor, sampler, count, lambda *args: self._beside_edge(scene, *args))
+        s = boundary.sample(scene, part.sensor, sampler, count, lambda *args: self._beside_edge(scene, *args))
         with dr.resume_grad():
-            value = Sample(mi.Spectrum(s.value * weights), s.alpha * weights)
-            return Term(s.position, value, s.wavelengths, 0.0, 0)
+            weight = weights * part.area
+            value = Sample(mi.Spectrum(s.value * weight), s.alpha * weight)
+            return Term(part.to_film(s.position), value, s.wavelengths, 0.0, 0)
 
-    def _shadows(self, scene, sensor, seed, sppi, weights, boundaries: Boundaries) -> Term:
-        """Shadows on what the camera sees, found from the lights."""
-        sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
+    def _shadows(self, scene, sensor, part: FilmPart, seed, sppi, weights, boundaries: Boundaries) -> Term:
+        """Shadows on what the camera sees, found from the lights, on one part of the film."""
+        sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi, part.sensor.film())
         share = boundaries.shading is not None and boundaries.shading.emission_at_first
-        s = boundaries.shadows.sample(scene, sensor, sampler, self._first_hit, share=share)
+        s = boundaries.shadows.sample(scene, part.sensor, sampler, self._first_hit, share=share)
         with dr.resume_grad():
-            value = Sample(mi.Spectrum(s.value * weights), mi.Float(0))
-            return Term(s.position, value, s.wavelengths, 0.0, 0)
+            value = Sample(mi.Spectrum(s.value * (weights * part.area)), mi.Float(0))
+            return Term(part.to_film(s.position), value, s.wavelengths, 0.0, 0)
 
     def _from_points(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
         """Boundaries as seen from one vertex of each path."""
@@ -397,7 +410,7 @@ class EdgeIntegrator(ADIntegrator):
         still = "nothing moves" if not moves else '"sppi" is 0' if not sppi else "nothing is lit"
         add(
             "film boundary",
-            self._line_samples(sensor, sppp),
+            sum(self._line_samples(part.sensor, sppp) for part in film_parts(sensor)),
             2 * path,
             film is not None and sppp,
             f"{film.counts[0] + film.counts[2] if film else 0} edges may move on the film",
@@ -590,9 +603,11 @@ class EdgeIntegrator(ADIntegrator):
         return tuple(self._override(own, spp, sensor) for own in (self.sppc, self.sppp, self.sppi))
 
     @staticmethod
-    def _sampler(sensor: mi.Sensor, seed: int | mi.UInt32, spp: int) -> tuple[mi.Sampler, int]:
+    def _sampler(
+        sensor: mi.Sensor, seed: int | mi.UInt32, spp: int, film: mi.Film | None = None
+    ) -> tuple[mi.Sampler, int]:
         """A sampler for one wavefront over the film, and its samples per pixel (some kinds round them up)."""
-        width, height = EdgeIntegrator._size(sensor.film())
+        width, height = EdgeIntegrator._size(film or sensor.film())
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()

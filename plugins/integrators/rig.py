@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling import FilmBoundary, Lights, stratified
+from rimlight.edge_sampling import FilmBoundary, FilmPart, Lights, ShadowBoundary, film_parts, stratified
 
-from ._edge_integrator import HARD_SHADOWS, Boundaries, EdgeIntegrator
+from ._edge_integrator import HARD_SHADOWS, EdgeIntegrator
 from ._layers import Layers, LayerSamples
 from ._light_paths import Backward, Forward, LightPaths, Measure, Splat
 
@@ -161,30 +161,37 @@ class RigIntegrator(EdgeIntegrator):
             paths.trace(to, sampler, ray, u, dr.detach(weight) / spp, self._choice(sampler, seed))
             if not forward:
                 to.finish()
-        if boundaries.film is not None and sppp:
-            self._film_boundary(scene, sensor, seed, sppp, paths, layers, boundaries.film, forward)
         if boundaries.shadows is not None:
-            samples = self._shadows(scene, sensor, seed, sppi, boundaries)
-            layers.forward(samples) if forward else layers.backward(samples)
+            boundaries.silhouettes.refit()
+        for i, part in enumerate(film_parts(sensor)):
+            part_seed = seed ^ i << 16
+            if boundaries.film is not None and sppp:
+                self._film_boundary(scene, sensor, part, part_seed, sppp, paths, layers, boundaries.film, forward)
+            if boundaries.shadows is not None:
+                samples = self._shadows(scene, sensor, part, part_seed, sppi, boundaries.shadows)
+                layers.forward(samples) if forward else layers.backward(samples)
         return layers
 
-    def _shadows(self, scene, sensor, seed, sppi, boundaries: Boundaries) -> LayerSamples:
-        """Shadows on what the camera sees; each belongs to one light."""
-        boundaries.silhouettes.refit()
-        sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi)
-        s = boundaries.shadows.sample(scene, sensor, sampler, self._first_hit, share=False)
-        return LayerSamples(s.position, s.light, s.value)
+    def _shadows(self, scene, sensor, part: FilmPart, seed, sppi, shadows: ShadowBoundary) -> LayerSamples:
+        """Shadows on what the camera sees, on one part of the film; each belongs to one light."""
+        sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi, part.sensor.film())
+        s = shadows.sample(scene, part.sensor, sampler, self._first_hit, share=False)
+        with dr.resume_grad():
+            return LayerSamples(part.to_film(s.position), s.light, s.value * part.area)
 
-    def _film_boundary(self, scene, sensor, seed, sppp, paths, layers, boundary: FilmBoundary, forward) -> None:
-        """Visibility as seen from the sensor: all lights, on both sides of the edges."""
-        count, seed = self._line_samples(sensor, sppp), 0xFFFFFFFF ^ seed
+    def _film_boundary(
+        self, scene, sensor, part: FilmPart, seed, sppp, paths, layers, boundary: FilmBoundary, forward
+    ) -> None:
+        """Visibility as seen from the sensor, on one part of its film: all lights, on both sides of the edges."""
+        count, seed = self._line_samples(part.sensor, sppp), 0xFFFFFFFF ^ seed
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(1)
         sampler.set_samples_per_wavefront(1)
         sampler.seed(seed, count)
-        points = boundary.points(scene, sensor, sampler, count)
+        points = boundary.points(scene, part.sensor, sampler, count)
+        position = part.to_film(points.position)
         with dr.resume_grad():
-            normal_velocity = dr.dot(points.n_dl, points.velocity)
+            normal_velocity = dr.dot(points.n_dl, points.velocity) * part.area
         weight = 1.0
         if forward:
             with dr.resume_grad():
@@ -195,11 +202,11 @@ class RigIntegrator(EdgeIntegrator):
         outline = points.outline | dr.full(mi.Bool, False, count)
         for sign, ray, ray_weight in zip((1, -1), points.rays, points.weights, strict=True):
             scale = ray_weight * (sign * weight)
-            paths.trace(to, sampler.clone(), ray, points.position, scale, choice, points.active, outline)
+            paths.trace(to, sampler.clone(), ray, position, scale, choice, points.active, outline)
         if not forward:
             dr.eval(to.total, points.n_dl)
             with dr.resume_grad():
-                normal_velocity = dr.dot(points.n_dl, points.velocity)
+                normal_velocity = dr.dot(points.n_dl, points.velocity) * part.area
                 dr.backward_from(to.total * normal_velocity, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
 
     def _light_boundaries(self, *args):
