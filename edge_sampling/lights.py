@@ -12,10 +12,10 @@ class Lights:
 
     An emitter of several lights is written in Python, and has besides Mitsuba's interface:
 
-    * `light_count`, int: the number of its lights;
-    * `light_sample(which: mi.UInt32, sample: mi.Point2f) -> tuple[mi.Point2f, mi.Float]`: the random numbers with which
-      its `sample_direction` chooses the light `which`, and the point `sample` of this; and the probability with which
-      uniform random numbers choose that light. Detached.
+    light_count : int, the number of its lights.
+    light_sample : maps (which: mi.UInt32, sample: mi.Point2f) to (mi.Point2f, mi.Float): the random numbers with which
+        its `sample_direction` chooses the light `which`, and the point `sample` of this; and the probability with which
+        uniform random numbers choose that light. Detached.
 
     Parameters
     ----------
