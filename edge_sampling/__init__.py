@@ -8,7 +8,7 @@ from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
 from .intersections import intersecting_meshes
 from .lights import Lights, has_hard_beam
-from .meshes import Geometry, jumping_textures
+from .meshes import Geometry, jumping_textures, objects_below
 from .motion import Motion, derivative_image
 from .projection import Projection
 from .shading_boundary import ShadingBoundary
@@ -45,6 +45,7 @@ __all__ = [
     "intersecting_meshes",
     "jumping_textures",
     "mean_and_error",
+    "objects_below",
     "resample",
     "sample_edge",
     "stratified",

@@ -17,8 +17,8 @@ from .meshes import Geometry
 class EdgeKind(IntEnum):
     """What makes an edge a boundary of the image.
 
-    JUMP   : always: it has one face only, or more than two, or its two sides differ in shape, texture coordinates or
-             attributes.
+    JUMP   : always: it has one face only, or more than two, or its two sides differ in shape, texture coordinates,
+             attributes, or the frame of tangents that a material looks at.
     FLAT   : as a silhouette, and where its faces are not coplanar: the shading normal is that of the face.
     SPLIT  : as a silhouette, and where the vertex normals of its two sides differ.
     SMOOTH : as a silhouette only.
@@ -85,7 +85,7 @@ def find_edges(geometry: Geometry) -> Edges:
     ------
     ValueError : a vertex is not finite.
     """
-    face_list, mesh_of_face, uv = [], [], []
+    face_list, mesh_of_face, values = [], [], []
     points, offset = [], 0
     for i, mesh in enumerate(geometry.meshes):
         f, v = meshes.faces(mesh), meshes.vertices(mesh)
@@ -94,13 +94,14 @@ def find_edges(geometry: Geometry) -> Edges:
         face_list.append(f.astype(np.int64) + offset)
         mesh_of_face.append(np.full(len(f), i, np.uint32))
         points.append(v)
-        t = meshes.texture_coordinates(mesh)
-        uv.append(np.zeros((len(v), 2), np.float32) if t is None else t)
+        values.append(meshes.vertex_values(mesh))
         offset += len(v)
     if not points:
         return _no_edges()
     face, mesh_of_face = np.concatenate(face_list), np.concatenate(mesh_of_face)
-    point, uv = np.concatenate(points), np.concatenate(uv)
+    point = np.concatenate(points)
+    width = max(t.shape[1] for t in values)
+    value = np.concatenate([np.pad(t, ((0, 0), (0, width - t.shape[1]))) for t in values])
 
     weld = _weld_equal(point)
     sides = _pair_sides(weld, face)
@@ -117,14 +118,14 @@ def find_edges(geometry: Geometry) -> Edges:
     mesh0, mesh1 = mesh_of_face[face0], mesh_of_face[face1]
 
     interpolated = np.array([meshes.has_interpolated_normals(m) for m in geometry.meshes])
-    face_attributes = np.array([meshes.has_face_attributes(m) for m in geometry.meshes])
+    everywhere = np.array([meshes.jumps_at_every_edge(m) for m in geometry.meshes])
     split = (i0 != i1) | (j0 != j1)
-    seam = split & ((uv[i0] != uv[i1]).any(1) | (uv[j0] != uv[j1]).any(1))
+    seam = split & ((value[i0] != value[i1]).any(1) | (value[j0] != value[j1]).any(1))
 
     kind = np.full(len(face0), EdgeKind.SMOOTH, np.uint8)
     kind[split] = EdgeKind.SPLIT
     kind[~interpolated[mesh0]] = EdgeKind.FLAT
-    kind[(count != 2) | (mesh0 != mesh1) | seam | face_attributes[mesh0]] = EdgeKind.JUMP
+    kind[(count != 2) | (mesh0 != mesh1) | seam | everywhere[mesh0]] = EdgeKind.JUMP
     return Edges(
         vertices=np.stack([np.stack([i0, j0], 1), np.stack([i1, j1], 1)], 1).astype(np.uint32),
         opposite=np.stack([o0, o1], 1).astype(np.uint32),

@@ -95,18 +95,47 @@ def vertices(mesh: Any) -> np.ndarray:
     return np.array(dr.detach(mesh.vertex_positions_buffer())).reshape(-1, 3)
 
 
-def texture_coordinates(mesh: Any) -> np.ndarray | None:
-    """Texture coordinates of a mesh: (V, 2) on the host, or None."""
-    return np.array(dr.detach(mesh.vertex_texcoords_buffer())).reshape(-1, 2) if mesh.has_vertex_texcoords() else None
+def texture_coordinates(mesh: Any) -> np.ndarray:
+    """Texture coordinates of a mesh: (V, 2), on the host, detached; or (V, 0)."""
+    if not mesh.has_vertex_texcoords():
+        return np.zeros((mesh.vertex_count(), 0), np.float32)
+    return np.array(dr.detach(mesh.vertex_texcoords_buffer())).reshape(-1, 2)
+
+
+def vertex_values(mesh: Any) -> np.ndarray:
+    """What a mesh interpolates between its vertices besides normals, texture coordinates and attributes: (V, K), on the
+    host, detached."""
+    known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+    names = [k for k in mi.traverse(mesh).properties if k.startswith("vertex_") and k not in known]
+    attributes = [np.array(dr.detach(mesh.attribute_buffer(k))).reshape(mesh.vertex_count(), -1) for k in names]
+    return np.concatenate([texture_coordinates(mesh), *attributes], axis=1)
 
 
 def has_interpolated_normals(mesh: Any) -> bool:
     return mesh.has_vertex_normals() and not mesh.has_face_normals()
 
 
-def has_face_attributes(mesh: Any) -> bool:
-    """Does the mesh carry attributes that are constant on a face, and so jump at each of its edges?"""
-    return any(k.startswith("face_") for k, _ in mi.traverse(mesh).items())
+def jumps_at_every_edge(mesh: Any) -> bool:
+    """Does something jump wherever two faces of the mesh meet? Attributes of faces; textures without texture
+    coordinates, for which the place inside of its own triangle stands; and what depends on the tangents of a face:
+    anisotropic materials, bump and normal maps."""
+    if any(k.startswith("face_") for k in mi.traverse(mesh).properties):
+        return True
+    materials = [m for m in (mesh.bsdf(), mesh.emitter()) if m is not None]
+    objects = [o for m in materials for o in objects_below(m).values()]
+    if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or _is_map(o)) for o in objects):
+        return True
+    return not mesh.has_vertex_texcoords() and any(_has_place(o) for o in objects)
+
+
+def _is_map(bsdf: mi.BSDF) -> bool:
+    return bsdf.class_name() in ("BumpMap", "NormalMap")
+
+
+def _has_place(texture: Any) -> bool:
+    """Is it a texture that varies over texture coordinates?"""
+    kinds = ("Bitmap", "Checkerboard")
+    return isinstance(texture, mi.Texture) and texture.class_name().startswith(kinds) and texture.is_spatially_varying()
 
 
 def _concat(buffers: list[mi.Float]) -> mi.Float:
@@ -116,31 +145,49 @@ def _concat(buffers: list[mi.Float]) -> mi.Float:
 
 
 def jumping_textures(scene: mi.Scene) -> list[str]:
-    """Names of the textures whose value jumps inside of a face: checkerboards, bitmaps with the `nearest` filter."""
-    return [f'"{t.id()}" ({t.class_name()})' for t in _objects(scene) if isinstance(t, mi.Texture) and _jumps(t)]
+    """Names of what jumps inside of faces: checkerboards, bitmaps with the `nearest` filter, and bump maps (where a
+    bitmap is continuous, its slope jumps at every texel)."""
+    uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if m.has_vertex_texcoords()]
+    uv = np.concatenate([[[0, 0], [1, 1]], *uv])
+    return [
+        f'"{name}" ({o.class_name().partition("TextureImpl")[0]})'
+        for name, o in objects_below(scene).items()
+        if (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
+        or (_has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))
+    ]
 
 
-def _objects(root: mi.Object) -> list[Any]:
-    """All objects below `root`, each once."""
-    found: list[Any] = []
+def objects_below(root: mi.Object) -> dict[str, Any]:
+    """All objects below `root`, and it, each once; by name, as `mi.traverse` makes names."""
+    found = {"": root}
+    seen = {id(root)}
 
     class Children(mi.TraversalCallback):
+        def __init__(self, parent: str):
+            super().__init__()
+            self.parent = parent
+
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            if isinstance(value, mi.Object) and value not in found:
-                found.append(value)
+            if isinstance(value, mi.Object) and id(value) not in seen:
+                seen.add(id(value))
+                key = value.id() if isinstance(value, mi.Shape) else name
+                found[f"{self.parent}.{key}".lstrip(".")] = value
 
         put_value = put_object = put
 
-    found.append(root)
-    for obj in found:  # grows as it goes
-        obj.traverse(Children())
+    queue = [""]
+    for name in queue:  # grows as it goes
+        before = len(found)
+        found[name].traverse(Children(name))
+        queue += list(found)[before:]
     return found
 
 
-def _jumps(texture: Any, pairs: int = 256, steps: int = 18) -> bool:
-    """Bisect random segments towards their steeper half: where a texture is continuous, the difference dies out."""
-    if not texture.is_spatially_varying() or not texture.class_name().startswith(("Bitmap", "Checkerboard")):
-        return False
+def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 256, steps: int = 22) -> bool:
+    """Bisect random segments towards their steeper half: where a texture is continuous, the difference dies out.
+
+    lower, upper : of the texture coordinates.
+    """
     with dr.suspend_grad():
         rng = mi.PCG32(size=pairs)
         si = dr.zeros(mi.SurfaceInteraction3f, pairs)
@@ -152,7 +199,10 @@ def _jumps(texture: Any, pairs: int = 256, steps: int = 18) -> bool:
             return texture.eval(si)
 
         difference = lambda f, g: dr.max(dr.abs(f - g))
-        p, q = mi.Point2f(rng.next_float32(), rng.next_float32()), mi.Point2f(rng.next_float32(), rng.next_float32())
+        point = lambda: dr.lerp(
+            mi.Point2f(lower), mi.Point2f(upper), mi.Point2f(rng.next_float32(), rng.next_float32())
+        )
+        p, q = point(), point()
         at_p, at_q = value(p), value(q)
         before = difference(at_p, at_q)
         for _ in range(steps):
@@ -161,4 +211,5 @@ def _jumps(texture: Any, pairs: int = 256, steps: int = 18) -> bool:
             left = difference(at_p, at_middle) > difference(at_middle, at_q)
             p, at_p = dr.select(left, p, middle), dr.select(left, at_p, at_middle)
             q, at_q = dr.select(left, middle, q), dr.select(left, at_middle, at_q)
-        return bool(dr.any((before > 0) & (difference(at_p, at_q) > 0.3 * before)))
+        # Rounding makes differences, too, where a texture is constant.
+        return bool(dr.any((before > 1e-3 * dr.max(before)) & (difference(at_p, at_q) > 0.3 * before)))

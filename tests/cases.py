@@ -503,6 +503,10 @@ def projector() -> dict:
     return {"type": "projector", "to_world": spot()["to_world"], "irradiance": bitmap, "fov": 40.0, "scale": 10.0}
 
 
+def led() -> dict:
+    return {"type": "led", "position": [-1, 4, -1], "axis": [0.3, -1, 0.2], "intensity": 20.0, "mu": 2.0}
+
+
 def distant(angular_radius: float = 0) -> Callable[[], dict]:
     """Three distant lights."""
     directions = "-0.5 1 -0.3, 0.5 1 0.1, 0.1 0.8 -0.9"
@@ -777,13 +781,17 @@ CASES = [
     Case("lit_room_camera", lit_room, CAMERA_X, 3e-3, 0.02, spp=1024),
     Case("projector_cube", hard_shadow(projector), SIDE, 6e-3, 0.02, spp=1024),
     Case("projector_turns", hard_shadow(projector), LAMP_TURN, 6e-3, 0.02, spp=1024),
-    Case("distant_cube", hard_shadow(distant()), SIDE, 6e-3, 0.02, spp=1024),
-    Case("distant_cube_turn", hard_shadow(distant()), TURN, 6e-3, 0.02, spp=1024),
+    Case("led_cube", hard_shadow(led), SIDE, 6e-3, 0.02, spp=1024),
+    Case("led_moves", hard_shadow(led), {"key": "lamp.position", "direction": [1, 0.3, 0.2]}, 6e-3, 0.02, spp=1024),
+    Case("distant_cube", hard_shadow(distant()), SIDE, 6e-3, 0.02, spp=1024, noisy=True),
+    Case("distant_cube_turn", hard_shadow(distant()), TURN, 6e-3, 0.02, spp=1024, noisy=True),
     Case("distant_lights", hard_shadow(distant()), DIRECTIONS, 6e-3, 0.02, spp=1024),
-    Case("distant_camera", hard_shadow(distant()), CAMERA_X, 6e-3, 0.02, spp=1024),
-    Case("discs_cube", hard_shadow(distant(5)), SIDE, 6e-3, 0.02, spp=1024, runs=24),
-    Case("discs_lights", hard_shadow(distant(5)), DIRECTIONS, 1e-2, 0.02, spp=1024, runs=24),
-    Case("discs_radius", hard_shadow(distant(5)), {"key": "lamp.angular_radius", "direction": [1]}, 0.2, 0.02),
+    Case("distant_camera", hard_shadow(distant()), CAMERA_X, 6e-3, 0.02, spp=1024, noisy=True),
+    Case("discs_cube", hard_shadow(distant(5)), SIDE, 6e-3, 0.02, spp=1024, runs=24, noisy=True),
+    Case("discs_lights", hard_shadow(distant(5)), DIRECTIONS, 1e-2, 0.02, spp=1024, noisy=True),
+    Case(
+        "discs_radius", hard_shadow(distant(5)), {"key": "lamp.angular_radius", "direction": [1]}, 0.2, 0.02, noisy=True
+    ),
     Case("smooth_torus_sun", torus_in_the_sun, TORUS_TURN, 6e-3, tolerance=0.04, spp=1024, largest_z=7),
     # Spheres, disks and cylinders.
     Case("sphere_sun", sphere_over(sun), THING_SIDE, 6e-3, 0.02, spp=1024),

@@ -31,6 +31,7 @@ from rimlight.edge_sampling import (
 )
 
 from ._cut_rays import CutRays
+from ._limits import PartialParameters, is_mirror, lets_through
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, up_to_horizon
 
@@ -40,13 +41,22 @@ HARD_SHADOWS = (
 )
 
 #: Parameters of a light that move the shadows in it.
-PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius")
+PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction")
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
 LINE = 16
 
 #: Longest path that a plan counts rays of.
 LONG = 16
+
+
+def _carries_gradient(params) -> bool:
+    """Does any of the parameters?"""
+    if not isinstance(params, mi.SceneParameters):
+        return dr.grad_enabled(params)
+    # Not by their names: some (of `hair`) are without a value, at which Mitsuba 3.9 stumbles.
+    values = (mi.get_property(v, kind, node) if kind else v for v, kind, node, _ in params.properties.values())
+    return any(dr.grad_enabled(v) for v in values if v is not None)
 
 
 @dataclass
@@ -116,6 +126,7 @@ class EdgeIntegrator(ADIntegrator):
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         self._geometry: Geometry | None = None
         self._edges: Edges | None = None
+        self._partial: PartialParameters | None = None
         self._boundaries: dict[tuple, Boundaries] = {}
         self._warned: set[str] = set()
 
@@ -132,7 +143,7 @@ class EdgeIntegrator(ADIntegrator):
         -------
         mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
         """
-        if params is not None and not dr.grad_enabled(dict(params)):
+        if params is not None and not _carries_gradient(params):
             raise RuntimeError(f"{self.name}: none of the parameters carries a gradient")
         with dr.suspend_grad():
             film, makers = self._terms(scene, sensor, seed, spp, dr.ADMode.Forward)
@@ -215,24 +226,27 @@ class EdgeIntegrator(ADIntegrator):
         if beyond_horizon is not False:
             up_to_horizon(si, ray, beyond_horizon)
         bsdf = si.bsdf(ray)
-        valid = active & si.is_valid() & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-        if scene.environment() is not None and not self.hide_emitters:
-            valid |= active
+        backdrop = active & (scene.environment() is not None and not self.hide_emitters)
         active &= si.is_valid()
+        scattering = Scattering(scene, attached=attached)
         if not self.depths.scatters(1):
-            return L, valid, [], None
+            return L, backdrop | scattering.stops(ray, pi, sampler, active), [], None
 
         # ---------------------- Light that it scatters ----------------------
 
-        direct, onwards = Scattering(scene, attached=attached).scatter(si, bsdf, sampler, active)
+        direct, onwards = scattering.scatter(si, bsdf, sampler, active)
         with dr.resume_grad(when=attached):
             L += direct
-        if self.depths.scatters(2):
+        valid = backdrop | (active & ~onwards.through)
+        if not self.depths.scatters(2):
+            valid |= scattering.stops(onwards.ray, onwards.pi, sampler, active & onwards.through)
+        else:
             first = self._camera_vertex(ray, pi)
             β = dr.select(active, dr.detach(onwards.weight), 0)
             second = Vertex(mi.Ray3f(onwards.ray), onwards.pi, first.depth + 1, β, mi.Float(onwards.η))
             again = sampler.clone() if attached else None
-            indirect = scattered_light(scene, sampler, second, self.depths, active)
+            indirect, stopped = scattered_light(scene, sampler, second, self.depths, active)
+            valid |= onwards.through & stopped
             with dr.resume_grad(when=attached):
                 L += dr.select(β != 0, indirect * onwards.weight / β, 0)
             if attached:
@@ -291,7 +305,7 @@ class EdgeIntegrator(ADIntegrator):
     def _onwards(self, scene, vertex, ray, pi, sampler, active) -> mi.Spectrum:
         """Light that is scattered towards `vertex` by what `ray` meets past an edge."""
         seen = Vertex(mi.Ray3f(ray), pi, vertex.depth + 1, dr.full(mi.Spectrum, 1, dr.width(active)), mi.Float(1))
-        return scattered_light(scene, sampler, seen, self.depths, active)
+        return scattered_light(scene, sampler, seen, self.depths, active)[0]
 
     # ---------------------- Derivative image ----------------------
 
@@ -468,8 +482,11 @@ class EdgeIntegrator(ADIntegrator):
             self._refuse_while_recording()
             self._geometry = geometry
             self._edges = find_edges(geometry)
+            self._partial = PartialParameters(scene)
             self._boundaries = {}
         with dr.resume_grad():
+            for limit in self._partial.limits():
+                self._warn_once(limit)
             geometry.refuse_moving_others(scene, self.name)
             moving = geometry.moving()
             camera = mi.traverse(sensor)
@@ -544,15 +561,29 @@ class EdgeIntegrator(ADIntegrator):
                 f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below "
                 "its cutoff_angle, and a projector an image with a black border."
             )
-        if sppi > 0 and any(s.bsdf() is not None and s.bsdf().flags() & mi.BSDFFlags.Delta for s in scene.shapes()):
+        if sppi > 0 and any(is_mirror(s) for s in scene.shapes()):
             limits.append(
                 "the derivative lacks the motion of what perfect mirrors and glass show; "
                 'give them a roughness, or set "sppi" to 0 to accept this.'
             )
+        through = names(s for s in scene.shapes() if lets_through(s))
+        if sppi > 0 and through and self.depths.scatters(2):
+            limits.append(
+                "the derivative lacks part of the motion of what is seen, and of what shines, through "
+                f"{', '.join(through)}; "
+                'cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
+            )
         textures = jumping_textures(scene)
         if textures:
             limits.append(
-                f"the derivative lacks the jumps of the textures {', '.join(textures)}; use a bilinear bitmap."
+                f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
+                "normal maps for bump maps."
+            )
+        suns = [e for e in scene.emitters() if e.class_name() == "SunskyEmitter"]
+        if (camera_moves or self._lights_move(scene, moving)) and suns:
+            limits.append(
+                "the derivative lacks the motion of the border of the sun; set the sun_scale of sunsky to 0, and add a "
+                "directional light."
             )
         casts = names(s for s in geometry.others if not s.is_emitter())
         if sppi > 0 and casts:

@@ -42,22 +42,29 @@ class Depths:
 
 def scattered_light(
     scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, depths: Depths, active: mi.Bool
-) -> mi.Spectrum:
-    """Light that arrives by way of `vertex`, without what it emits: mi.Spectrum, (N,), detached; times its β."""
+) -> tuple[mi.Spectrum, mi.Bool]:
+    """Light that arrives by way of a vertex.
+
+    Returns
+    -------
+    L : mi.Spectrum, (N,), without what the vertex emits; times its β; detached.
+    stopped : mi.Bool, (N,), does the path meet, there or farther on, a surface that it does not go through as if
+        nothing was there?
+    """
     scattering = Scattering(scene, attached=False)
 
-    def bounce(L, vertex, active, sampler):
+    def bounce(L, stopped, vertex, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), sampler, active)
         L += dr.select(active, vertex.β * direct, 0)
+        last = active & onwards.through & ~depths.scatters(vertex.depth + 1)
+        stopped |= (active & ~onwards.through) | scattering.stops(onwards.ray, onwards.pi, sampler, last)
         vertex, active = step(vertex, onwards, sampler, depths, active)
-        return L, vertex, active, sampler
+        return L, stopped, vertex, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
-    L = dr.zeros(mi.Spectrum, dr.width(vertex.depth))
-    return dr.while_loop((L, vertex, active, sampler), lambda L, v, active, s: active, bounce, label="scattered light")[
-        0
-    ]
+    state = (dr.zeros(mi.Spectrum, dr.width(vertex.depth)), mi.Bool(False), vertex, active, sampler)
+    return dr.while_loop(state, lambda L, stopped, v, active, s: active, bounce, label="scattered light")[:2]
 
 
 class Replay:
@@ -168,7 +175,7 @@ def choose_vertex(
         bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
         ray = si.spawn_ray(si.to_world(bs.wo))
         pi = scene.ray_intersect_preliminary(ray, active=active & depths.scatters(vertex.depth + 1))
-        vertex, active = step(vertex, Next(ray, pi, weight, bs.eta), sampler, depths, active)
+        vertex, active = step(vertex, Next(ray, pi, weight, bs.eta, mi.Bool(False)), sampler, depths, active)
         return total, kept, vertex, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)

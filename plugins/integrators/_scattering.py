@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import mis_weight
 
+from ._limits import divides_by_density
+
 
 @dataclass
 class Next:
@@ -16,12 +18,14 @@ class Next:
     ray, pi : the ray to it, and what that meets. Detached.
     weight : throughput, mi.Spectrum; attached where wanted.
     η : relative index of refraction along the ray.
+    through : mi.Bool, does the ray go on as if nothing was there?
     """
 
     ray: mi.Ray3f
     pi: mi.PreliminaryIntersection3f
     weight: mi.Spectrum
     η: mi.Float
+    through: mi.Bool
 
 
 class Scattering:
@@ -52,6 +56,8 @@ class Scattering:
         # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
+        self.any_null = any(f & mi.BSDFFlags.Null for f in bsdfs)
+        self.by_density = [mi.BSDFPtr(b) for s in scene.shapes() if (b := s.bsdf()) and divides_by_density(b)]
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
 
@@ -146,21 +152,34 @@ class Scattering:
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
                     turned, at_mirror = bsdf.sample(context, si, sample1, sample2, active & mirrored)
+                    for other in self.by_density:
+                        at_mirror[bsdf == other] = at_mirror * (turned.pdf / dr.detach(turned.pdf))
                     onwards_turned = mi.Ray3f(ray)
                     onwards_turned.o, onwards_turned.d = si.p, si.to_world(turned.wo)
                     slid = pi.compute_surface_interaction(onwards_turned, mi.RayFlags.All, active & mirrored)
                     y = dr.select(mirrored, slid, y)
                     attached = dr.select(mirrored, at_mirror, attached)
                 weight = dr.replace_grad(weight, dr.select(active, attached, 0))
+        through = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if not self.any_hit_by_rays:
-            return mi.Spectrum(0), Next(ray, pi, weight, bs.eta)
+            return mi.Spectrum(0), Next(ray, pi, weight, bs.eta, through)
         emitter = y.emitter(scene, active)
         ds = mi.DirectionSample3f(scene, y, si)
         pdf = self.pdf_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
         mis = dr.select(mirrored, 1, mis_weight(bs.pdf, pdf))
         with dr.resume_grad(when=self.attached):
             Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
-        return Le, Next(ray, pi, weight, bs.eta)
+        return Le, Next(ray, pi, weight, bs.eta, through)
+
+    def stops(self, ray, pi, sampler, active) -> mi.Bool:
+        """Does a ray meet a surface that it does not go through as if nothing was there?"""
+        active = active & pi.is_valid()
+        if not self.any_null:
+            return active
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        numbers = sampler.next_1d(active), sampler.next_2d(active)
+        bs, _ = si.bsdf(ray).sample(mi.BSDFContext(), si, *numbers, active)
+        return active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
     def pdf_direction(self, si, ds, active) -> mi.Float:
         """Density with which `ds` would have been sampled as a light."""
