@@ -17,7 +17,7 @@ def z_scores(
 
     bias : a known bound on the error of the reference that is not noise.
     """
-    floor = max(1e-3 * np.abs(reference).max(), np.finfo(np.float32).tiny)  # an image may be black
+    floor = max(1e-3 * np.abs(reference).max(), float(np.finfo(np.float32).tiny))  # an image may be black
     variance = _pooled(error**2) + _pooled(reference_error.astype(float) ** 2)
     return (mean - reference) / np.sqrt(variance + bias**2 + floor**2)
 

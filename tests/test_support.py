@@ -327,7 +327,7 @@ class Chart:
         """Mean derivative and its standard error, and the finite differences."""
         reference = finite_differences(self.scene, self.motion, step=self.step, runs=6, spp=1024)
         integrator = mi.load_dict({"type": "direct_edge"})
-        images = [derivative_image(self.scene, integrator, self.motion, spp=128, seed=100 + i) for i in range(8)]
+        images = [derivative_image(self.scene, integrator, self.motion, spp=128, seed=100 + i) for i in range(16)]
         return *mean_and_error(np.array(images, np.float64)), reference
 
     def compare(self, name: str) -> tuple[float, float, float]:
