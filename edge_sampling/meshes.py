@@ -121,8 +121,7 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     anisotropic materials, bump and normal maps."""
     if any(k.startswith("face_") for k in mi.traverse(mesh).properties):
         return True
-    materials = [m for m in (mesh.bsdf(), mesh.emitter()) if m is not None]
-    objects = [o for m in materials for o in objects_below(m).values()]
+    objects = list(objects_below(mesh).values())
     if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or _is_map(o)) for o in objects):
         return True
     return not mesh.has_vertex_texcoords() and any(_has_place(o) for o in objects)
