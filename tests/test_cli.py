@@ -48,11 +48,9 @@ def folder(tmp_path) -> Path:
         scene_with('<shape type="ply"><string name="filename" value="gone.ply"/></shape>')
     )
     (path / "no_sensor.xml").write_text(scene_with('<shape type="cube"/>', sensor=""))
-    (path / "sphere.xml").write_text(
-        scene_with('<shape type="sphere" id="ball"><translate name="to_world" z="5"/></shape>').replace(
-            '<translate name="to_world" z="5"/>', '<transform name="to_world"><translate z="5"/></transform>'
-        )
-    )
+    group = '<shape type="shapegroup" id="group"><shape type="cube"/></shape>'
+    copy = '<shape type="instance" id="copy"><ref id="group"/></shape>'
+    (path / "instance.xml").write_text(scene_with(group + copy))
     for name, type_, width in (("no_width", "perspective", 0), ("no_width_orthographic", "orthographic", 0)):
         film = f'<film type="hdrfilm"><integer name="width" value="{width}"/></film>'
         (path / f"{name}.xml").write_text(scene_with("", sensor=f'<sensor type="{type_}" id="camera">{film}</sensor>'))
@@ -153,8 +151,8 @@ def test_bad_options(capfd, tmp_path, options, culprits):
 
 def test_a_shape_that_cannot_move(capfd, folder, tmp_path):
     out = tmp_path / "out"
-    options = ["--param", "ball.to_world", "--direction", "1,0,0", "--spp", "1", "--out", str(out)]
-    check_refused(capfd, ["gradient", str(folder / "sphere.xml"), *options], out, 'shape "ball" (Sphere)')
+    options = ["--param", "copy.to_world", "--direction", "1,0,0", "--spp", "1", "--out", str(out)]
+    check_refused(capfd, ["gradient", str(folder / "instance.xml"), *options], out, 'shape "copy" (Instance)')
 
 
 def test_vertices_that_are_not_finite():

@@ -14,6 +14,8 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
+from rimlight._registration import plugin_modules
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
 
@@ -85,11 +87,13 @@ def test_snippets_run(page, tmp_path):
 @pytest.mark.parametrize("name", [p.stem for p in sorted((ROOT / "docs" / "plugins").glob("*.rst"))])
 def test_tabs_of_manual_pages_load(name):
     """The XML and the Python of a plugin's page make objects of the same type."""
-    page = inspect.getdoc(type(mi.load_dict({"type": name})))
+    (module,) = (m for k, m in plugin_modules(mi.variant()).items() if k.rpartition(".")[2] == name)
+    (page,) = (text for c in vars(module).values() if inspect.isclass(c) and "code-tab::" in (text := c.__doc__ or ""))
+    page = inspect.cleandoc(page)
     tabs = dict(re.findall(r"\.\. code-tab:: (\w+)\n\n(.*?)(?=\n *\.\. code-tab|\Z)", page, re.DOTALL))
     python = mi.load_dict(eval(f"{{{textwrap.dedent(tabs['python'])}}}", {"mi": mi}))
     xml = mi.load_string(tabs["xml"].strip().replace(">", ' version="3.0.0">', 1))
-    assert type(python) is type(xml) is type(mi.load_dict({"type": name}))
+    assert type(python) is type(xml)
 
 
 @pytest.mark.parametrize("line", COMMANDS)
