@@ -135,6 +135,16 @@ class Curves:
             to_world = lambda w: x * w.x + y * w.y + z * w.z
             return CurvePoint(p, to_world(tangent) / PIECES, to_world(inwards), valid)
 
+    def misses(self, frames: mi.Float, piece: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
+        """Is the piece on a rim of a cylinder, beyond whose contour the ray goes?"""
+        curve = piece // PIECES
+        kind = dr.gather(mi.UInt32, self._kind, curve)
+        x, y, z, o = self._columns(frames, curve, 12)
+        to_local = lambda v: x * v.x + y * v.y + z * v.z
+        d, p = to_local(ray.d), to_local(ray.o) + o
+        rim = (kind == int(CurveKind.BOTTOM)) | (kind == int(CurveKind.TOP))
+        return rim & (dr.square(p.x * d.y - p.y * d.x) > dr.square(d.x) + dr.square(d.y))
+
     def _columns(self, frames: mi.Float, curve: mi.UInt32, start: int) -> list[mi.Vector3f]:
         """Images of the axes, and of the origin."""
         first = dr.gather(mi.UInt32, self._shape, curve) * 24 + start

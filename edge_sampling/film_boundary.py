@@ -197,6 +197,12 @@ class FilmBoundary:
                 weights.append(weight)
             if self.edges is not None:
                 active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, index, 0), p, rays))
+            if self.curves is not None:
+                # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
+                # that: a jump of the contour's, which would count twice.
+                wall = projection.tangent(c.p, mi.Point3f(c.p + c.inwards), mi.Float(0), aperture_sample)
+                missed = [self.curves.misses(frames, piece, ray) for ray in rays]
+                active &= is_line | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
             outline = dr.full(mi.Bool, True, count)
             if lights is not None:
                 outline = ~is_edge | self._jumps(projection, positions, dr.select(is_edge, index, 0))

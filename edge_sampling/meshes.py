@@ -169,8 +169,10 @@ def objects_below(root: mi.Object) -> dict[str, Any]:
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
             if isinstance(value, mi.Object) and id(value) not in seen:
                 seen.add(id(value))
-                key = value.id() if isinstance(value, mi.Shape) else name
-                found[f"{self.parent}.{key}".lstrip(".")] = value
+                key = f"{self.parent}.{value.id() if isinstance(value, mi.Shape) else name}".lstrip(".")
+                while key in found:
+                    key += "'"
+                found[key] = value
 
         put_value = put_object = put
 

@@ -799,7 +799,7 @@ CASES = [
     Case("sphere_sun", sphere_over(sun), THING_SIDE, 6e-3, 0.02, spp=1024),
     Case("sphere_soft", sphere_over(ceiling_light), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),
     Case("sphere_camera", sphere_over(sun), CAMERA_X, 6e-3, 0.02, spp=1024),
-    Case("sphere_sky", sphere_over(constant), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),
+    Case("sphere_sky", sphere_over(constant), THING_SIDE, 1e-2, 0.02, spp=1024, seeds=64, runs=96),
     Case("disk_sun_turn", disk_over(sun), THING_TURN, 6e-3, 0.02, spp=1024),
     Case("disk_soft", disk_over(ceiling_light), THING_SIDE, 1e-2, 0.02, spp=1024, runs=24),
     Case("cylinder_sun_turn", cylinder_over(sun), THING_TURN, 6e-3, 0.02, spp=1024),

@@ -33,7 +33,7 @@ from rimlight.edge_sampling import (
 from ._cut_rays import CutRays
 from ._limits import PartialParameters, is_mirror, lets_through
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
-from ._scattering import Scattering, up_to_horizon
+from ._scattering import Scattering, met_by, up_to_horizon
 
 HARD_SHADOWS = (
     "the derivative has the hard shadows of lights without size (point, spot, directional, ...) on what the camera "
@@ -219,8 +219,8 @@ class EdgeIntegrator(ADIntegrator):
 
         # A surface that moves is met by a fixed ray; a ray that moves with the camera takes its hit along.
         pi = self._first_hit(scene, ray, active)
+        si = met_by(ray, pi, mi.RayFlags.All, active, attached)
         with dr.resume_grad(when=attached):
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
         if beyond_horizon is not False:
@@ -503,7 +503,7 @@ class EdgeIntegrator(ADIntegrator):
         key = (moving, camera_moves, lights_move, sppi > 0)
         if key not in self._boundaries:
             self._refuse_while_recording()
-            limits = self._limits(scene, moving, camera_moves, sppi)
+            limits = self._limits(scene, moving, camera_moves, lights_move, sppi)
             for limit in limits:
                 self._warn_once(limit)
             on_film = np.array([m or camera_moves for m in moving], bool)
@@ -545,7 +545,7 @@ class EdgeIntegrator(ADIntegrator):
         others = [mi.traverse(e) for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
         return any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
 
-    def _limits(self, scene, moving, camera_moves, sppi) -> tuple[str, ...]:
+    def _limits(self, scene, moving, camera_moves, lights_move, sppi) -> tuple[str, ...]:
         """What the derivative will lack."""
         limits = []
         geometry = self._geometry
@@ -579,8 +579,7 @@ class EdgeIntegrator(ADIntegrator):
                 f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
                 "normal maps for bump maps."
             )
-        suns = [e for e in scene.emitters() if e.class_name() == "SunskyEmitter"]
-        if (camera_moves or self._lights_move(scene, moving)) and suns:
+        if (camera_moves or lights_move) and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
             limits.append(
                 "the derivative lacks the motion of the border of the sun; set the sun_scale of sunsky to 0, and add a "
                 "directional light."

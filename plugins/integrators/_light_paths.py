@@ -19,7 +19,7 @@ from rimlight.edge_sampling import Lights
 from ._cut_rays import CutRays
 from ._layers import Layers
 from ._paths import Depths, Vertex, step
-from ._scattering import Scattering, up_to_horizon
+from ._scattering import Scattering, met_by, up_to_horizon
 
 #: Light samples of one vertex differ by these, modulo 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom
 #: sequences", R2). By itself, each is uniform.
@@ -109,9 +109,9 @@ class Place:
         """The surface there; attached, if `scattering` is, to a ray that is fixed on the film, and from the second
         vertex on to the material point."""
         follow = lambda number: mi.RayFlags.FollowShape if number > 1 else mi.RayFlags.Empty
+        flags = mi.RayFlags.All | follow(self.number)
+        si = met_by(self.ray, self.pi, flags, active, scattering.attached)
         with dr.resume_grad(when=scattering.attached):
-            flags = mi.RayFlags.All | follow(self.number)
-            si = self.pi.compute_surface_interaction(self.ray, flags, active)
             if scattering.attached and self.before is not None and scattering.directional:
                 ray, pi = self.before
                 flags = mi.RayFlags.Minimal | follow(self.number - 1)

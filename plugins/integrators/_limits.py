@@ -32,8 +32,10 @@ def is_mirror(shape: mi.Shape) -> bool:
 
 
 def divides_by_density(bsdf: mi.BSDF) -> bool:
-    """Is the weight f / p of a perfect reflection attached to its probability p, or f to nothing but p? Then
-    f / p · p, over the present p, has the gradient that it should. (Other BSDFs of Mitsuba 3.9 do that themselves.)"""
+    """Must the weight f / p of a perfect reflection be multiplied by its attached probability p, over the present p, to
+    have the gradient of f? (In Mitsuba 3.9, the weights of other BSDFs have that already.)"""
+    if not bsdf.flags() & mi.BSDFFlags.Delta:
+        return False
     if bsdf.class_name() == "TwoSidedBRDF":
         return any(divides_by_density(b) for b in objects_below(bsdf).values() if isinstance(b, mi.BSDF) and b != bsdf)
     return bsdf.class_name() in ("SmoothPlastic", "ThinDielectric")

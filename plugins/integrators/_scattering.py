@@ -57,7 +57,7 @@ class Scattering:
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
         self.any_null = any(f & mi.BSDFFlags.Null for f in bsdfs)
-        self.by_density = [mi.BSDFPtr(b) for s in scene.shapes() if (b := s.bsdf()) and divides_by_density(b)]
+        self.by_density = [mi.BSDFPtr(s.bsdf()) for s in scene.shapes() if s.bsdf() and divides_by_density(s.bsdf())]
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
 
@@ -152,8 +152,11 @@ class Scattering:
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
                     turned, at_mirror = bsdf.sample(context, si, sample1, sample2, active & mirrored)
+                    wrong = mi.Bool(False)
                     for other in self.by_density:
-                        at_mirror[bsdf == other] = at_mirror * (turned.pdf / dr.detach(turned.pdf))
+                        wrong |= bsdf == other
+                    p = dr.detach(turned.pdf)
+                    at_mirror *= dr.select(wrong & (p > 0), turned.pdf / dr.select(p > 0, p, 1), 1)
                     onwards_turned = mi.Ray3f(ray)
                     onwards_turned.o, onwards_turned.d = si.p, si.to_world(turned.wo)
                     slid = pi.compute_surface_interaction(onwards_turned, mi.RayFlags.All, active & mirrored)
@@ -245,6 +248,24 @@ class Scattering:
             return area
         si = pi.compute_surface_interaction(ray, mi.RayFlags.dPdUV | mi.RayFlags.FollowShape, on_other)
         return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
+
+
+#: Cosine below which a curved surface is taken to stand still, as a fixed ray meets it. Where the ray meets it moves as
+#: 1 / cos, and single precision does not know cosines of 1e-4: single samples would outweigh all others. The loss is of
+#: this order, relative to what the surface itself contributes.
+GRAZING = 1e-3
+
+
+def met_by(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, flags: mi.RayFlags, active: mi.Bool, attached: bool
+) -> mi.SurfaceInteraction3f:
+    """The surface that a ray meets; with all its derivatives but where it is curved, and seen edge-on."""
+    with dr.resume_grad(when=attached):
+        si = pi.compute_surface_interaction(ray, flags, active)
+        if attached:
+            grazing = active & ~pi.shape.is_mesh() & (dr.abs_dot(dr.detach(si.n), dr.detach(ray.d)) < GRAZING)
+            si = dr.select(grazing, dr.detach(si), si)
+        return si
 
 
 def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool | bool) -> None:

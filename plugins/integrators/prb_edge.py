@@ -56,8 +56,8 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     what the camera sees, hard ones too, are found from the lights.
 
     **Limits.** Those of ``direct_edge``, but for interreflections; what perfect mirrors and glass show is taken not to
-    move, with a warning. In corners of rooms, the derivative with respect to the camera has infinite variance: it is
-    right in the mean, and noisy. Participating media are not supported.
+    move, and part of what is seen through masks, with a warning. In corners of rooms, the derivative with respect to
+    the camera has infinite variance: it is right in the mean, and noisy. Participating media are not supported.
 
     .. tabs::
         .. code-tab:: xml

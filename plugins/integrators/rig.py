@@ -213,8 +213,8 @@ class RigIntegrator(EdgeIntegrator):
         shadows, _ = super()._light_boundaries(*args)
         return shadows, None
 
-    def _limits(self, scene, moving, camera_moves, sppi) -> tuple[str, ...]:
-        limits = super()._limits(scene, moving, camera_moves, sppi)
+    def _limits(self, scene, moving, camera_moves, lights_move, sppi) -> tuple[str, ...]:
+        limits = super()._limits(scene, moving, camera_moves, lights_move, sppi)
         if sppi > 0 and (self.depths.scatters(2) or scene.environment() is not None):
             limits = (*(limit for limit in limits if limit != HARD_SHADOWS), SHADOWS_ON_FILM)
         return limits
