@@ -12,9 +12,9 @@ import pytest
 
 from rimlight import scenes
 from rimlight.cli import main
-from rimlight.cli._loading import InputError, check_scene
 from rimlight.edge_sampling import FiniteDifferences, derivative_image
 from rimlight.edge_sampling.exr import read_exr
+from rimlight.loading import InputError, check_scene
 
 TRIANGLES = str(scenes.path("two_triangles"))
 SMALL = ["-D", "res=16"]

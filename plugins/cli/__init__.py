@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import tyro
 
+from rimlight.loading import InputError
+
 from ._commands import COMMANDS
-from ._loading import InputError
 
 __all__ = ["main"]
 

@@ -20,10 +20,11 @@ import rimlight
 from rimlight import pictures
 from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image, finite_differences
 from rimlight.edge_sampling.exr import write_exr
+from rimlight.loading import InputError, expected, load_integrator, load_scene, use_variant
 
 from . import _loading
 from ._comparison import Comparison, compare
-from ._loading import InputError, at_least, expected
+from ._loading import at_least
 
 #: Samples of one launch. More are split, so that a progress bar can move and an interruption is heard.
 MAX_SAMPLES = 2**20
@@ -50,8 +51,8 @@ class _OnScene:
     """Variant of Mitsuba."""
 
     def load(self) -> Any:
-        _loading.use_variant(self.variant)
-        return _loading.load_scene(self.scene, self.define)
+        use_variant(self.variant)
+        return load_scene(self.scene, self.define)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,7 +212,7 @@ class PlanCommand(_OnSensor):
     def run(self) -> int:
         at_least(1, spp=self.spp)
         scene = self.load()
-        integrator = _loading.load_integrator(self.integrator)
+        integrator = load_integrator(self.integrator)
         if not hasattr(integrator, "plan"):
             raise InputError(f'--integrator: "{self.integrator}" has no plan, use direct_edge or prb_edge')
         keys = list(self.param) or [
@@ -240,7 +241,7 @@ class Render(_OnSensor):
         to_file = self.out.suffix == ".exr"
         _loading.check_output(self.out, folder=not to_file)
         scene = self.load()
-        integrator = _loading.load_integrator(self.integrator)
+        integrator = load_integrator(self.integrator)
         start = time.perf_counter()
         image = _accumulate(
             lambda seed, spp: mi.render(scene, integrator=integrator, sensor=self.sensor, spp=spp, seed=seed),
@@ -271,7 +272,7 @@ class Gradient(_OnMotion):
         at_least(1, spp=self.spp)
         _loading.check_output(self.out, folder=True)
         scene = self.load()
-        integrator = _loading.load_integrator(self.integrator)
+        integrator = load_integrator(self.integrator)
         motion = self.load_motion(scene)
         launches = _seeds(self.spp, self.pixels(scene), self.seed)
 
@@ -361,7 +362,7 @@ class Check(_OnMotion):
                 raise InputError(f'--out: "{self.out}" must end in .png')
             _loading.check_output(self.out, folder=False)
         scene = self.load()
-        integrator = _loading.load_integrator(self.integrator)
+        integrator = load_integrator(self.integrator)
         motion = self.load_motion(scene)
         what = str(motion)
 
@@ -423,7 +424,7 @@ class Demo:
         from rimlight.inverse import demo
 
         _loading.check_output(self.out, folder=True)
-        _loading.use_variant("llvm_ad_rgb")
+        use_variant("llvm_ad_rgb")
         with _writing():
             demo.main(self.out)
         return 0

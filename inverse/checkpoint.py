@@ -1,0 +1,52 @@
+"""Checkpoints: one NumPy archive, arrays and a JSON text, without pickles; complete or not there."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rimlight.edge_sampling.exr import replacing
+
+#: Of the file's layout.
+VERSION = 1
+
+
+def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
+    """Write a checkpoint in place of the last one, which stays until this one is complete.
+
+    arrays : name -> array of numbers. facts : whatever JSON can say.
+
+    Raises
+    ------
+    OSError : it cannot be written. The last one is still there.
+    """
+    text = json.dumps({**facts, "version": VERSION})
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **{f"array/{name}": array for name, array in arrays.items()}, facts=np.array(text))
+
+
+def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and facts of a checkpoint.
+
+    Raises
+    ------
+    ValueError : the file is damaged, or none of ours.
+    OSError : it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            facts = json.loads(str(file["facts"]))
+            arrays = {name.removeprefix("array/"): file[name] for name in file.files if name != "facts"}
+    except FileNotFoundError:
+        raise FileNotFoundError(f'fit: there is no checkpoint "{path}" to resume from') from None
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f'fit: "{path}" is no checkpoint, or damaged: {error}') from None
+    if facts.get("version") != VERSION:
+        raise ValueError(f'fit: "{path}" has the layout {facts.get("version")}, this program writes {VERSION}')
+    return arrays, facts

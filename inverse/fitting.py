@@ -1,0 +1,460 @@
+"""The loop of a fit: render, compare, step; stage after stage; and what is left when it ends, however it ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from . import checkpoint, free_parameters, losses
+from . import problem as problems
+from .free_parameters import Parameter, to_numpy
+from .optimisers import Optimiser
+from .problem import Problem, Stage
+from .renderer import Gradient, Renderer, Task, derived_seed
+
+log = logging.getLogger(__name__)
+
+#: Steps over which the loss is averaged before it is compared.
+WINDOW = 10
+
+#: A stage goes on while its loss falls by this fraction within `patience` steps.
+FALL = 1e-3
+
+#: Seconds between checkpoints.
+INTERVAL = 5.0
+
+#: Pictures of an animation.
+FRAMES = 48
+
+#: Samples per pixel of the pictures of a result.
+FINAL_SPP = 256
+
+#: Evaluates tasks, in their order.
+Executor = Callable[[Mapping[str, np.ndarray], Sequence[Task]], list[Gradient]]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stage, for one of several starts."""
+
+    stage: Stage
+    start: int | None = None
+
+
+@dataclass
+class Progress:
+    """Where a fit is, and what it has seen; all of it is in a checkpoint.
+
+    segment, iteration : place in the plan. step : of all.
+    losses, segments : of each step. errors : label -> one number before each step, and one at the end, if the truth is
+        known. frames : (step, latents) for an animation.
+    skipped : gradients that were not finite; bad : of them, without a finite one since.
+    touched : latents whose gradient was ever not zero.
+    best_loss, best : mean of the loss over `WINDOW` steps of the present segment, and the latents then.
+    fell : last iteration of the segment at which the loss had fallen.
+    found : of starts that have been tried: mean loss at their end, and latents.
+    seconds : in the loop, of all runs.
+    """
+
+    segment: int = 0
+    iteration: int = 0
+    step: int = 0
+    losses: list[float] = field(default_factory=list)
+    segments: list[int] = field(default_factory=list)
+    errors: dict[str, list[float]] = field(default_factory=dict)
+    frames: list[tuple[int, dict[str, np.ndarray]]] = field(default_factory=list)
+    skipped: int = 0
+    bad: int = 0
+    touched: set[str] = field(default_factory=set)
+    best_loss: float = float("inf")
+    best: dict[str, np.ndarray] = field(default_factory=dict)
+    fell: int = 0
+    found: list[tuple[float, dict[str, np.ndarray]]] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class ViewOfFit:
+    """Pictures of one target: (H, W, C), float32, linear; weight : (H, W)."""
+
+    start: np.ndarray
+    result: np.ndarray
+    target: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a fit found.
+
+    status : "finished", "interrupted", "out of time", or why it gave up.
+    values : key -> result, as `mi.traverse(scene)` has it: flat, a matrix (4, 4), or a tensor.
+    latents, start : of each free parameter: name -> array; the result, and where it began.
+    losses, segments : (steps,), loss at a noisy render before each step, and the number of its segment.
+    errors : label -> (steps + 1,), distance from the truth, where that is known.
+    silent : names of parameters whose gradient was always 0: the pictures do not depend on them.
+    skipped : steps that were left out because their gradient was not finite.
+    seconds : in the loop. views : pictures before and after. measures : of each view, label -> before and after.
+    frames : (step, picture of the first view) from start to end.
+    """
+
+    problem: Problem
+    status: str
+    values: dict[str, np.ndarray]
+    latents: dict[str, np.ndarray]
+    start: dict[str, np.ndarray]
+    losses: np.ndarray
+    segments: np.ndarray
+    errors: dict[str, np.ndarray]
+    silent: list[str]
+    skipped: int
+    seconds: float
+    views: list[ViewOfFit]
+    measures: list[dict[str, tuple[float, float]]]
+    frames: list[tuple[int, np.ndarray]]
+
+
+def fit(
+    problem: Problem,
+    *,
+    out: Path | str | None = None,
+    resume: bool = False,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> Fit:
+    """Fit the free parameters of a problem to its targets.
+
+    Parameters
+    ----------
+    problem : what to fit. Paths in it are relative to the working directory.
+    out : folder for checkpoints and the problem. The result itself is written by `rimlight.inverse.write`.
+    resume : go on from the checkpoint in `out`. With one thread (`drjit.set_thread_count(1)`) the result is bit by bit
+        that of a fit that was not interrupted; with several, sums of gradients differ in their last bits, in any two
+        runs alike.
+    executor : evaluates gradients elsewhere. Default: here, one after the other.
+    progress : show a bar on standard error.
+
+    Raises
+    ------
+    ValueError, OSError : the problem cannot be posed, or the checkpoint is not one of it. The text is one line.
+
+    Ctrl-C ends the fit after the present step, with a result; pressed twice, at once.
+    """
+    return Run(problem, out=out, resume=resume, executor=executor).finish(progress)
+
+
+class Run:
+    """A fit under way."""
+
+    def __init__(
+        self, problem: Problem, *, out: Path | str | None = None, resume: bool = False, executor: Executor | None = None
+    ):
+        self.problem = problem
+        self.file = None if out is None else Path(out) / "checkpoint.npz"
+        self.renderer = Renderer(problem)
+        for view in self.renderer.views:
+            view.picture()
+        self.parameters = free_parameters.find(problem.free, self.renderer.params)
+        self.truth_is_known = all(target.file is None for target in problem.target)
+        self.optimisers = [Optimiser(parameter, problem) for parameter in self.parameters]
+        self.executor: Executor = executor or (lambda values, tasks: [self.renderer.gradient(values, t) for t in tasks])
+        self.start = self._latents()
+        starts = problem.starts.count
+        explored = [Segment(problem.stage[0], k) for k in range(starts)] if starts > 1 else [Segment(problem.stage[0])]
+        self.plan = [*explored, *map(Segment, problem.stage[1:])]
+        self.total = sum(segment.stage.iterations for segment in self.plan)
+        self.progress = Progress()
+        self._stop = False
+        self._disk_failed = False
+        if resume:
+            self._restore()
+        else:
+            self._begin()
+            if self.file is not None:
+                self.file.parent.mkdir(parents=True, exist_ok=True)
+                problems.write(self.file.parent / "problem.toml", problem)
+                self._save()
+
+    # ---------------------- The loop ----------------------
+
+    def finish(self, progress: bool = True) -> Fit:
+        """Run to the end, and render the result."""
+        now = self.progress
+        status = "finished"
+        saved = began = time.monotonic()
+        before = now.seconds
+        with (
+            self._listening(),
+            tqdm(total=self.total, initial=now.step, desc="fit", disable=None if progress else True) as bar,
+        ):
+            while now.segment < len(self.plan):
+                self.step()
+                now.seconds = before + time.monotonic() - began
+                bar.update()
+                bar.set_postfix(self._shown(), refresh=False)
+                if now.bad >= self.problem.max_bad:
+                    status = f"gave up: {now.bad} gradients in a row were not finite"
+                elif self._stop:
+                    status = "interrupted"
+                elif self.problem.seconds is not None and now.seconds > self.problem.seconds:
+                    status = "out of time"
+                if status != "finished":
+                    break
+                if time.monotonic() - saved > INTERVAL:
+                    self._save()
+                    saved = time.monotonic()
+        self._save()
+        return self._result(status)
+
+    def step(self) -> None:
+        """One step of the plan."""
+        now, segment = self.progress, self.plan[self.progress.segment]
+        stage = segment.stage
+        attached = [optimiser.values() for optimiser in self.optimisers]
+        values = {key: to_numpy(value) for of_one in attached for key, value in of_one.items()}
+        tasks = [
+            Task(i, stage.resolution, stage.spp, derived_seed(self.problem.seed, now.step, i))
+            for i in range(len(self.problem.target))
+        ]
+        found = self.executor(values, tasks)
+        loss = float(np.mean([f.loss for f in found]))
+        gradients = {
+            key: sum((f.gradients[key] for f in found if key in f.gradients), np.float32(0)) / len(found)
+            for key in values
+        }
+        self._note(loss)
+        if np.isfinite(loss) and all(np.isfinite(g).all() for g in gradients.values()):
+            now.bad = 0
+            done = now.iteration / max(stage.iterations - 1, 1)
+            for optimiser, of_one in zip(self.optimisers, attached, strict=True):
+                if any(np.any(gradients[key]) for key in of_one):
+                    now.touched.add(optimiser.parameter.name)
+                optimiser.step(of_one, gradients, stage.rate * stage.decay**done)
+        else:
+            now.skipped += 1
+            now.bad += 1
+        now.step += 1
+        now.iteration += 1
+        if now.step == WINDOW:
+            for name in self.silent():
+                log.warning('"%s" has no influence on the pictures: its gradient is 0', name)
+        if now.iteration >= stage.iterations or self._stalls():
+            self._next_segment()
+
+    def silent(self) -> list[str]:
+        """Names of parameters whose gradient was always 0."""
+        return [p.name for p in self.parameters if p.name not in self.progress.touched]
+
+    def _note(self, loss: float) -> None:
+        """Keep what is known before a step."""
+        now = self.progress
+        latents = self._latents()
+        self._note_errors(latents)
+        every = -(-self.total // FRAMES)
+        if now.step % every == 0:
+            now.frames.append((now.step, latents))
+        now.losses.append(loss)
+        now.segments.append(now.segment)
+        if now.iteration + 1 >= WINDOW:
+            mean = float(np.mean(now.losses[-WINDOW:]))
+            if mean < now.best_loss * (1 - FALL):
+                now.fell = now.iteration
+            if mean < now.best_loss:
+                now.best_loss, now.best = mean, latents
+
+    def _note_errors(self, latents: dict[str, np.ndarray]) -> None:
+        if self.truth_is_known:
+            for parameter in self.parameters:
+                for label, error in parameter.errors(latents).items():
+                    self.progress.errors.setdefault(label, []).append(error)
+
+    def _stalls(self) -> bool:
+        now = self.progress
+        return self.problem.patience is not None and now.iteration - now.fell > self.problem.patience + WINDOW
+
+    def _next_segment(self) -> None:
+        now, segment = self.progress, self.plan[self.progress.segment]
+        if segment.start is not None:
+            now.found.append((float(np.mean(now.losses[-min(WINDOW, now.iteration) :])), self._latents()))
+        last = now.segment == len(self.plan) - 1
+        if last and now.best:
+            self._restart(now.best)
+        now.segment += 1
+        now.iteration = 0
+        if not last:
+            self._begin()
+
+    def _begin(self) -> None:
+        """Enter a segment."""
+        now, segment = self.progress, self.plan[self.progress.segment]
+        now.best_loss, now.best, now.fell = float("inf"), {}, 0
+        if segment.start is not None:
+            self._restart(self._start(segment.start))
+        elif now.found:
+            self._restart(min(now.found, key=lambda entry: entry[0])[1])
+            now.found = []
+
+    def _start(self, number: int) -> dict[str, np.ndarray]:
+        if number == 0:
+            return self.start
+        rng = np.random.default_rng((self.problem.seed, number))
+        spread = self.problem.starts
+        scattered = [p.scatter(rng, spread.move, spread.turn, spread.value) for p in self.parameters]
+        return {name: latent for of_one in scattered for name, latent in of_one.items()}
+
+    def _restart(self, latents: Mapping[str, np.ndarray]) -> None:
+        for optimiser in self.optimisers:
+            optimiser.restart(latents)
+
+    def _latents(self) -> dict[str, np.ndarray]:
+        return {name: latent for optimiser in self.optimisers for name, latent in optimiser.latents().items()}
+
+    def _shown(self) -> dict[str, str]:
+        now = self.progress
+        shown = {"loss": f"{now.losses[-1]:.2e}"}
+        for label, errors in list(now.errors.items())[:2]:
+            shown[label.split(" (")[0]] = f"{errors[-1]:.2e}"
+        return shown
+
+    # ---------------------- Interruption ----------------------
+
+    @contextmanager
+    def _listening(self) -> Iterator[None]:
+        """Within it, Ctrl-C ends the loop after the present step; pressed again, at once."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def stop(number: int, frame: Any) -> None:
+            self._stop = True
+            signal.signal(signal.SIGINT, previous)
+
+        previous = signal.signal(signal.SIGINT, stop)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, previous)
+
+    def _save(self) -> None:
+        """Write a checkpoint. A disk that is full is said once; the fit goes on, and the last checkpoint stays."""
+        if self.file is None:
+            return
+        now = self.progress
+        arrays = {f"optimiser/{name}": a for o in self.optimisers for name, a in o.state().items()}
+        arrays |= {f"best/{name}": a for name, a in now.best.items()}
+        arrays |= {f"frame/{i}/{name}": a for i, (_, of_one) in enumerate(now.frames) for name, a in of_one.items()}
+        arrays |= {f"found/{i}/{name}": a for i, (_, of_one) in enumerate(now.found) for name, a in of_one.items()}
+        facts = {
+            f.name: getattr(now, f.name)
+            for f in dataclasses.fields(now)
+            if f.name not in ("best", "frames", "found", "touched")
+        }
+        facts |= {
+            "problem": problems.text(self.problem),
+            "touched": sorted(now.touched),
+            "frames": [step for step, _ in now.frames],
+            "found": [loss for loss, _ in now.found],
+        }
+        try:
+            checkpoint.save(self.file, arrays, facts)
+        except OSError as error:
+            if not self._disk_failed:
+                log.warning("%s; the fit goes on, its last checkpoint stays", error)
+            self._disk_failed = True
+
+    def _restore(self) -> None:
+        if self.file is None:
+            raise ValueError("fit: to resume, name the folder that holds the checkpoint")
+        arrays, facts = checkpoint.load(self.file)
+        before, now = (problems.parse(text) for text in (facts.pop("problem"), problems.text(self.problem)))
+        differ = sorted(key for key in {**before, **now} if before.get(key) != now.get(key) and key != "seconds")
+        if differ:
+            raise ValueError(
+                f'fit: "{self.file}" belongs to a fit with another {", ".join(differ)}; undo that, or start anew'
+            )
+        facts.pop("version")
+        part = lambda prefix: {k.removeprefix(prefix): a for k, a in arrays.items() if k.startswith(prefix)}
+        frames = [(step, part(f"frame/{i}/")) for i, step in enumerate(facts.pop("frames"))]
+        found = [(loss, part(f"found/{i}/")) for i, loss in enumerate(facts.pop("found"))]
+        touched = set(facts.pop("touched"))
+        self.progress = Progress(**facts, frames=frames, found=found, touched=touched, best=part("best/"))
+        for optimiser in self.optimisers:
+            optimiser.restore(part("optimiser/"))
+
+    # ---------------------- Result ----------------------
+
+    def _result(self, status: str) -> Fit:
+        now = self.progress
+        if status != "finished" and now.best:
+            self._restart(now.best)
+        latents = self._latents()
+        self._note_errors(latents)
+        values = self._values(latents)
+        spp = lambda view: max(1, min(FINAL_SPP, 2**22 // (view.size[0] * view.size[1])))
+        views, measures = [], []
+        for i, view in enumerate(self.renderer.views):
+            task = Task(i, None, spp(view), derived_seed(self.problem.seed, 2**31, i))
+            before, after = (self.renderer.image(v, task) for v in (self._values(self.start), values))
+            target, weight = view.picture()
+            views.append(ViewOfFit(before, after, target, weight))
+            compared = [losses.measures(image, target, weight) for image in (before, after)]
+            measures.append({label: (compared[0][label], compared[1][label]) for label in compared[0]})
+        small = Task(0, min(self.renderer.views[0].size[1], 256), 32, derived_seed(self.problem.seed, 2**31 + 1))
+        steps = [*now.frames, (now.step, latents)]
+        frames = [(step, self.renderer.image(self._values(at), small)) for step, at in steps]
+        self.renderer.image(values, Task(0, None, 1, 0))  # leave the scene at the result
+        return Fit(
+            problem=self.problem,
+            status=status,
+            values=values,
+            latents=latents,
+            start=self.start,
+            losses=np.array(now.losses),
+            segments=np.array(now.segments),
+            errors={label: np.array(errors) for label, errors in now.errors.items()},
+            silent=self.silent() if now.step else [],
+            skipped=now.skipped,
+            seconds=now.seconds,
+            views=views,
+            measures=measures,
+            frames=frames,
+        )
+
+    def _values(self, latents: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        held = {name: mi.Float(latent) for name, latent in latents.items()}
+        return {key: to_numpy(value) for p in self.parameters for key, value in p.values(held).items()}
+
+
+def parameters_of(fit: Fit) -> list[Parameter]:
+    """The free parameters of a fit, as its scene has them."""
+    return free_parameters.find(fit.problem.free, Renderer(fit.problem).params)
+
+
+def summary(fit: Fit) -> str:
+    """A fit in JSON: settings apart, everything but pictures and long arrays."""
+    return json.dumps(
+        {
+            "status": fit.status,
+            "steps": len(fit.losses),
+            "seconds": round(fit.seconds, 3),
+            "skipped": fit.skipped,
+            "no influence": fit.silent,
+            "errors": {label: [float(e[0]), float(e[-1])] for label, e in fit.errors.items()},
+            "pictures": fit.measures,
+            "values": {key: value.ravel().tolist() for key, value in fit.values.items() if value.size <= 64},
+        },
+        indent=2,
+    )

@@ -1,0 +1,340 @@
+"""Free parameters: what an optimiser holds (latent numbers), and what a scene makes of it (its parameters)."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .problem import Free
+
+#: Legal ranges of what a parameter's name says it is; the first that fits counts.
+RANGES = (
+    (r"(reflectance|transmittance|opacity|weight|metallic|specular|sheen|clearcoat|flatness|anisotropic)\b", 0, 1),
+    (r"(tint|spec_trans|spec_tint|diff_trans|base_color|color)\b", 0, 1),
+    (r"(alpha|alpha_u|alpha_v|roughness)\b", 1e-3, 1),
+    (r"(eta|int_ior|ext_ior)\b", 1.0001, 5),
+    (r"(radiance|irradiance|intensity|scale|sun_scale|sky_scale)\b", 0, np.inf),
+    (r"fov\b", 1, 170),
+)
+
+
+class Parameter(ABC):
+    """One entry of `Problem.free`, in a scene.
+
+    name : for people; unique.
+    free : what was asked for.
+    start, truth : latent name -> array of float32; where the fit begins, and the present state of the scene, which is
+        the truth if the target is rendered from it.
+    """
+
+    def __init__(self, name: str, free: Free):
+        self.name, self.free = name, free
+        self.truth: dict[str, np.ndarray] = {}
+        self.start: dict[str, np.ndarray] = {}
+
+    @abstractmethod
+    def values(self, latents: Mapping[str, mi.Float]) -> dict[str, Any]:
+        """Scene parameters, by key, attached if the latents are."""
+
+    def rates(self) -> dict[str, float]:
+        """Learning rate of each latent."""
+        return dict.fromkeys(self.start, self.free.rate)
+
+    def legal(self, name: str, latent: np.ndarray) -> np.ndarray:
+        """The nearest legal latent."""
+        return latent
+
+    def mask(self, name: str) -> np.ndarray | None:
+        """Which numbers of a latent are free. None: all."""
+        return None
+
+    def scatter(self, rng: np.random.Generator, move: float, turn: float, value: float) -> dict[str, np.ndarray]:
+        """A start elsewhere: normally distributed around the one that was asked for."""
+        return {
+            name: self.legal(name, (start + value * rng.standard_normal(start.shape)).astype(np.float32))
+            for name, start in self.start.items()
+        }
+
+    def errors(self, latents: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Distance from the truth, by a label with its unit."""
+        return {
+            f"{name}": float(np.sqrt(np.mean(np.square(latents[name] - truth)))) for name, truth in self.truth.items()
+        }
+
+
+class RigidBody(Parameter):
+    """Vertices of meshes, or transformations, that move together by a twist: a displacement and a rotation vector about
+    a centre, both in world space. Their values at the truth are what the scene has."""
+
+    def __init__(self, name: str, free: Free, initial: Mapping[str, Any]):
+        super().__init__(name, free)
+        self.initial = dict(initial)
+        points = np.concatenate([_points(value) for value in initial.values()])
+        #: (3,), world space.
+        self.centre = points.mean(0)
+        #: Radius of the body; of a camera or light alone, 1.
+        self.size = float(np.linalg.norm(points - self.centre, axis=1).max()) if len(points) > 1 else 1.0
+        self.move, self.turn = f"{name}.move", f"{name}.turn"
+        self.truth = {self.move: np.zeros(3, np.float32), self.turn: np.zeros(3, np.float32)}
+        start = _numbers(free.start, {6}, name, "6 numbers") if free.start else np.zeros(6)
+        self.start = {self.move: start[:3].astype(np.float32), self.turn: np.radians(start[3:]).astype(np.float32)}
+
+    def values(self, latents):
+        shift, rotation = (dr.unravel(mi.Vector3f, latents[k]) for k in (self.move, self.turn))
+        moved = rotate_and_shift(rotation, shift, mi.Point3f(self.centre))
+        return {
+            key: moved @ value if _is_transform(value) else dr.ravel(moved @ dr.unravel(mi.Point3f, value))
+            for key, value in self.initial.items()
+        }
+
+    def rates(self):
+        turn = self.free.rate / self.size if self.free.turn_rate is None else self.free.turn_rate
+        return {self.move: self.free.rate, self.turn: turn}
+
+    def mask(self, name):
+        return _axes(self.free.move if name == self.move else self.free.turn)
+
+    def scatter(self, rng, move, turn, value):
+        spread = {self.move: move, self.turn: np.radians(turn)}
+        return {
+            name: (start + spread[name] * self.mask(name) * rng.standard_normal(3)).astype(np.float32)
+            for name, start in self.start.items()
+        }
+
+    def errors(self, latents):
+        turned = _rotation(latents[self.turn]).T @ _rotation(self.truth[self.turn])
+        angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
+        shift = np.linalg.norm(latents[self.move] - self.truth[self.move])
+        found = {}
+        if self.free.move:
+            found[f"{self.name}: distance (scene units)"] = float(shift)
+        if self.free.turn:
+            found[f"{self.name}: angle (degrees)"] = float(angle)
+        return found
+
+
+class Vertices(Parameter):
+    """Vertex positions, one by one. Vertices of equal position stay together, so that seams do not open."""
+
+    def __init__(self, name: str, free: Free, key: str, initial: mi.Float, faces: mi.UInt):
+        super().__init__(name, free)
+        self.key = key
+        place = np.array(initial, np.float32).reshape(-1, 3)
+        _, first, weld = np.unique(place, axis=0, return_index=True, return_inverse=True)
+        self.first, self.weld = first, mi.UInt(weld.ravel())
+        self.chosen = self._chosen(len(place))[first].ravel()
+        offset = (
+            _numbers(free.start, {3, place.size}, name, f"3 or {place.size} numbers") if free.start else np.zeros(3)
+        )
+        started = place + np.resize(offset, place.shape).astype(np.float32) * self.chosen.reshape(-1, 3)[self.weld]
+        self.large_steps = _large_steps(initial, faces, free.smoothing) if free.smoothing else None
+        self.truth, self.start = {key: self._latent(place)}, {key: self._latent(started)}
+
+    def _latent(self, place: np.ndarray) -> np.ndarray:
+        if self.large_steps:
+            return np.array(self.large_steps.to_differential(mi.Float(place.ravel())), np.float32)
+        return place[self.first].ravel()
+
+    def values(self, latents):
+        if self.large_steps:
+            return {self.key: self.large_steps.from_differential(latents[self.key])}
+        return {self.key: dr.ravel(dr.gather(mi.Point3f, latents[self.key], self.weld))}
+
+    def mask(self, name):
+        return None if self.large_steps else self.chosen
+
+    def _chosen(self, count: int) -> np.ndarray:
+        """1 where a coordinate is free: (count, 3)."""
+        chosen = np.tile(_axes(self.free.move), (count, 1))
+        if self.free.vertices:
+            if max(self.free.vertices) >= count or min(self.free.vertices) < 0:
+                raise ValueError(f'fit: "{self.name}" has vertices 0 … {count - 1}, got {list(self.free.vertices)}')
+            chosen[np.setdiff1d(np.arange(count), self.free.vertices)] = 0
+        if self.free.smoothing and not chosen.all():
+            raise ValueError(f'fit: smoothing moves all vertices of "{self.name}" in all directions')
+        return chosen
+
+    def errors(self, latents):
+        place = lambda x: np.array(self.values({self.key: mi.Float(x)})[self.key]).reshape(-1, 3)
+        distance = np.linalg.norm(place(latents[self.key]) - place(self.truth[self.key]), axis=1)
+        return {
+            f"{self.name}: root mean square distance (scene units)": float(np.sqrt(np.mean(distance**2))),
+            f"{self.name}: farthest vertex (scene units)": float(distance.max()),
+        }
+
+
+class Values(Parameter):
+    """Numbers of a material, light, texture or lens, within their legal range."""
+
+    def __init__(self, name: str, free: Free, key: str, initial: Any):
+        super().__init__(name, free)
+        self.key, self.kind = key, type(initial)
+        self.shape = initial.shape if dr.is_tensor_v(initial) else None
+        truth = to_numpy(initial).ravel().astype(np.float32)
+        low, high = next(((a, b) for pattern, a, b in RANGES if re.search(pattern, key)), (-np.inf, np.inf))
+        self.low = low if free.lower is None else free.lower
+        self.high = high if free.upper is None else free.upper
+        counts = {1, len(truth)}
+        start = _numbers(free.start, counts, name, f"1 or {len(truth)} numbers") if free.start else truth
+        self.truth = {key: truth}
+        self.start = {key: np.resize(start, len(truth)).astype(np.float32)}
+        if not np.array_equal(self.legal(key, self.start[key]), self.start[key]) and not free.unit_length:
+            raise ValueError(
+                f'fit: "{key}" starts outside of its legal range {self.low} … {self.high}; '
+                "set lower and upper if that is meant"
+            )
+
+    def values(self, latents):
+        return {self.key: from_flat(latents[self.key], self.kind, self.shape)}
+
+    def legal(self, name, latent):
+        latent = np.clip(latent, self.low, self.high)
+        if self.free.unit_length:
+            rows = latent.reshape(-1, 3)
+            latent = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).ravel()
+        return latent.astype(np.float32)
+
+    def errors(self, latents):
+        """Root mean square error over the root mean square of the truth."""
+        truth, now = self.truth[self.key], latents[self.key]
+        size = np.sqrt(np.mean(np.square(truth))) or 1
+        return {f"{self.name}: relative error": float(np.sqrt(np.mean(np.square(now - truth))) / size)}
+
+
+# ------------------------------------------------------------------ from a problem to parameters
+
+
+def find(free: Iterable[Free], params: Any) -> list[Parameter]:
+    """The free parameters in a scene.
+
+    params : `mi.traverse(scene)`.
+
+    Raises
+    ------
+    ValueError : a key is unknown, is free twice, cannot be differentiated, or `start` does not fit it.
+    """
+    found: list[Parameter] = []
+    seen: set[str] = set()
+    for entry in free:
+        for key in entry.key:
+            _check_key(key, params)
+            if key in seen:
+                raise ValueError(f'fit: "{key}" is free twice')
+            seen.add(key)
+        moves_whole = lambda key, kind=entry.kind: (
+            _is_transform(params[key]) or (kind == "pose" and key.endswith("vertex_positions"))
+        )
+        rigid = [key for key in entry.key if moves_whole(key)]
+        if rigid:
+            name = _body(rigid[0]) if len(rigid) == 1 else " + ".join(map(_body, rigid[:3])) + " …" * (len(rigid) > 3)
+            found.append(RigidBody(name, entry, {key: _copy(params[key]) for key in rigid}))
+        for key in entry.key:
+            if key in rigid:
+                continue
+            if key.endswith("vertex_positions"):
+                faces = params[key.replace("vertex_positions", "faces")]
+                found.append(Vertices(_body(key), entry, key, _copy(params[key]), faces))
+            else:
+                found.append(Values(key, entry, key, _copy(params[key])))
+    return found
+
+
+def _check_key(key: str, params: Any) -> None:
+    if key not in params:
+        close = difflib.get_close_matches(key, list(params.keys()), n=3, cutoff=0.4)
+        raise ValueError(
+            f'fit: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
+        )
+    value = params[key]
+    if not _is_transform(value) and not (dr.is_diff_v(value) and dr.is_float_v(value)):
+        raise ValueError(f'fit: "{key}" is of type {type(value).__name__}, which has no derivative')
+
+
+# ------------------------------------------------------------------ values of scenes
+
+
+def to_numpy(value: Any) -> np.ndarray:
+    """A scene parameter as float32: a matrix (4, 4), a tensor in its shape, else flat."""
+    value = dr.detach(value)
+    if _is_transform(value):
+        return np.array(value.matrix, np.float32).reshape(4, 4)
+    return np.array(value if dr.is_tensor_v(value) else dr.ravel(value), np.float32)
+
+
+def from_flat(flat: mi.Float, kind: type, shape: Any = None) -> Any:
+    """A scene parameter of this type from its numbers, attached if they are."""
+    if dr.is_tensor_v(kind):
+        return kind(flat, shape)
+    if _is_transform_type(kind):
+        rows = [[dr.gather(mi.Float, flat, 4 * i + j) for j in range(4)] for i in range(4)]
+        return mi.Transform4f(mi.Matrix4f(rows))
+    return dr.unravel(kind, flat) if dr.size_v(kind) > 1 else kind(flat)
+
+
+def rotate_and_shift(rotation: mi.Vector3f, shift: mi.Vector3f, centre: mi.Point3f) -> mi.Transform4f:
+    """x -> exp([rotation]×) (x − centre) + centre + shift, by Rodrigues' formula; smooth at 0 as well."""
+    θ2 = dr.squared_norm(rotation)
+    small = θ2 < 1e-4
+    safe = dr.select(small, 1, θ2)
+    θ = dr.sqrt(safe)
+    a = dr.select(small, 1 - θ2 / 6, dr.sin(θ) / θ)
+    b = dr.select(small, 0.5 - θ2 / 24, (1 - dr.cos(θ)) / safe)
+    x, y, z = rotation
+    K = mi.Matrix3f([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    R = dr.identity(mi.Matrix3f) + a * K + b * (K @ K)
+    t = centre + shift - R @ centre
+    rows = [[R[i, 0], R[i, 1], R[i, 2], t[i]] for i in range(3)]
+    return mi.Transform4f(mi.Matrix4f([*rows, [0, 0, 0, 1]]))
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(np.asarray(vector, np.float64)).as_matrix()
+
+
+def _is_transform(value: Any) -> bool:
+    return hasattr(value, "matrix") and hasattr(value, "inverse")
+
+
+def _is_transform_type(kind: type) -> bool:
+    return "Transform" in kind.__name__
+
+
+def _points(value: Any) -> np.ndarray:
+    """Points of a body, (N, 3), world space: vertices, or the origin of a frame."""
+    if _is_transform(value):
+        return to_numpy(value)[None, :3, 3]
+    return to_numpy(value).reshape(-1, 3)
+
+
+def _copy(value: Any) -> Any:
+    return type(value)(dr.detach(value))
+
+
+def _axes(letters: str) -> np.ndarray:
+    return np.array([axis in letters for axis in "xyz"], np.float32)
+
+
+def _body(key: str) -> str:
+    return key.rpartition(".")[0] or key
+
+
+def _numbers(numbers: tuple[float, ...], counts: set[int], name: str, expected: str) -> np.ndarray:
+    if len(numbers) not in counts or not np.isfinite(numbers).all():
+        raise ValueError(f'fit: the start of "{name}" needs {expected}, got {len(numbers)}')
+    return np.array(numbers, np.float64)
+
+
+def _large_steps(positions: mi.Float, faces: mi.UInt, smoothing: float) -> Any:
+    try:
+        return mi.ad.LargeSteps(positions, faces, smoothing)
+    except ImportError as error:
+        raise ValueError("fit: smoothing needs the package cholespy: pip install cholespy") from error

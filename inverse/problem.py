@@ -1,0 +1,292 @@
+"""What is to be fitted, to what, and how: frozen dataclasses, which TOML files and the command line fill in."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cattrs
+import tomli_w
+from cattrs.gen import make_dict_structure_fn
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+Kind = Literal["pose", "material", "light", "shape"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A picture that the scene should look like."""
+
+    file: Path | None = None
+    """Picture: EXR, PNG or JPEG. Without one, the scene as its file has it is rendered, and is the truth."""
+    scene: Path | None = None
+    """Scene that the picture shows, if not the one of the problem."""
+    sensor: int = 0
+    """Number of the sensor that took it."""
+    colour: Literal["auto", "linear", "srgb"] = "auto"
+    """How its numbers relate to radiance. auto: EXR is linear, PNG and JPEG are sRGB."""
+    alpha: bool = False
+    """Weigh pixels by the alpha channel of the picture."""
+    mask: Path | None = None
+    """Picture whose black pixels do not count."""
+    resize: bool = False
+    """Resample a picture that has not the size of the film."""
+    spp: int = 4096
+    """Samples per pixel, where the target is rendered."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free:
+    """Something that may change. What its numbers mean depends on the parameter: `to_world`, and vertex positions if
+    `kind` is "pose", move as a rigid body; other vertex positions one by one; all else as it is."""
+
+    key: tuple[str, ...]
+    """Parameters as `rimlight params` lists them. Several ones move together as a rigid body, or are fitted alike."""
+    kind: Kind
+    """What it is. `rimlight fit KIND` fits those of one kind."""
+    rate: float = 0.01
+    """Length of the first steps: scene units for positions, the parameter's own otherwise."""
+    turn_rate: float | None = None
+    """Angle of the first steps of a rigid body, radians. Default: `rate` divided by its size."""
+    move: str = "xyz"
+    """World axes along which vertices or a rigid body may move."""
+    turn: str = "xyz"
+    """World axes about which a rigid body may turn; it turns about its centre, a camera about its own."""
+    vertices: tuple[int, ...] = ()
+    """Only these vertices are free. Default: all."""
+    smoothing: float = 0
+    """λ of Mitsuba's large steps (Nicolet et al. 2021) for vertices; 0: none. Needs the package cholespy."""
+    lower: float | None = None
+    """Smallest legal value. Default: what the name of the parameter implies."""
+    upper: float | None = None
+    """Largest legal value; likewise."""
+    unit_length: bool = False
+    """Its rows are directions, and kept at unit length."""
+    start: tuple[float, ...] = ()
+    """Where to start. For rigid bodies a displacement and a rotation vector in degrees, 6 numbers; for vertices a
+    displacement of each, or one for all; else the value, or one number for all. Default: what the scene has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loss:
+    """How much two pictures differ: the weighted mean over pixels and channels."""
+
+    norm: Literal["l1", "l2", "relative"] = "l2"
+    """|d|, d², or d² / (t² + 0.01) with the target t."""
+    pyramid: int = 0
+    """Levels of a Gaussian pyramid; the loss is the mean of theirs. 0: only the pictures themselves."""
+    exclude_above: float | None = None
+    """Pixels whose target exceeds this radiance in any channel do not count."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A part of the fit."""
+
+    iterations: int = 100
+    """Steps."""
+    resolution: int | None = None
+    """Width of the film, pixels. Default: that of the scene."""
+    spp: int = 4
+    """Samples per pixel of the image, and as many of the derivative."""
+    rate: float = 1
+    """Factor of all rates at its begin."""
+    decay: float = 1
+    """Factor of the rates at its end over those at its begin; between them they fall exponentially."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Starts:
+    """Several starts, of which the best after the first stage goes on. The first is the start as given."""
+
+    count: int = 1
+    """How many."""
+    move: float = 0
+    """Standard deviation of displacements of rigid bodies along their free axes, scene units."""
+    turn: float = 0
+    """Standard deviation of their rotation vectors, degrees."""
+    value: float = 0
+    """Standard deviation of other parameters, in their units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A fit, complete. Written to TOML and read from it without loss."""
+
+    scene: Path
+    """Scene file of Mitsuba 3."""
+    define: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Parameters of the scene file."""
+    target: tuple[Target, ...] = (Target(),)
+    """Pictures."""
+    free: tuple[Free, ...]
+    """What may change."""
+    loss: Loss = Loss()
+    """What is to be small."""
+    stage: tuple[Stage, ...] = (Stage(),)
+    """One after the other."""
+    starts: Starts = Starts()
+    """Where to begin."""
+    integrator: dict[str, Any] = dataclasses.field(default_factory=lambda: {"type": "prb_edge"})
+    """Plugin that renders and differentiates, with its parameters."""
+    optimiser: Literal["adam", "sgd"] = "adam"
+    """Mitsuba's. With sgd, `rate` is a factor of the gradient, not a length."""
+    momentum: float = 0.9
+    """Of sgd; the first decay rate of adam."""
+    smooth_scale: float = 0.99
+    """The second decay rate of adam."""
+    clip: float | None = None
+    """Longest gradient of one parameter, as a multiple of the median of its last 50 lengths."""
+    seed: int = 0
+    """Of all random numbers."""
+    patience: int | None = None
+    """End a stage whose loss has not fallen by 0.1 % for so many steps. Default: never."""
+    seconds: float | None = None
+    """End the fit after this time."""
+    max_bad: int = 20
+    """Give up after so many gradients in a row that are not finite. Each is skipped, and counted."""
+    freeze: bool = True
+    """Record the step once and replay it, where integrator and sensor allow that."""
+    variant: str = "llvm_ad_rgb"
+    """Variant of Mitsuba."""
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+# ------------------------------------------------------------------ checks
+
+
+def check(problem: Problem) -> None:
+    """Refuse what cannot be meant.
+
+    Raises
+    ------
+    ValueError : a number is out of range, or something is missing. The text names it as the TOML file does.
+    """
+    if not problem.free:
+        raise ValueError("fit: nothing is free, add a table [[free]]")
+    if not problem.target or not problem.stage:
+        raise ValueError("fit: a fit needs at least one target and one stage")
+    at_least = {"seed": 0, "max_bad": 1, "patience": 1, "seconds": 0, "clip": 0}
+    _at_least("", problem, at_least)
+    for name in ("momentum", "smooth_scale"):
+        if not 0 <= getattr(problem, name) < 1:
+            raise ValueError(f"fit: {name} must be in [0, 1), got {getattr(problem, name)}")
+    if "type" not in problem.integrator:
+        raise ValueError('fit: integrator needs a "type"')
+    _at_least("loss.", problem.loss, {"pyramid": 0, "exclude_above": 0})
+    _at_least("starts.", problem.starts, {"count": 1, "move": 0, "turn": 0, "value": 0})
+    if problem.starts.count > 1 and not (problem.starts.move or problem.starts.turn or problem.starts.value):
+        raise ValueError(
+            "fit: several starts need starts.move, starts.turn or starts.value, else they are all the same"
+        )
+    for i, stage in enumerate(problem.stage):
+        _at_least(f"stage.{i}.", stage, {"iterations": 1, "resolution": 1, "spp": 1})
+        _positive(f"stage.{i}.", stage, ("rate", "decay"))
+    for i, target in enumerate(problem.target):
+        _at_least(f"target.{i}.", target, {"sensor": 0, "spp": 1})
+    for i, free in enumerate(problem.free):
+        where = f"free.{i}."
+        if not free.key:
+            raise ValueError(f"fit: {where}key is empty")
+        _positive(where, free, ("rate", "turn_rate"))
+        _at_least(where, free, {"smoothing": 0})
+        for name in ("move", "turn"):
+            axes = getattr(free, name)
+            if set(axes) - set("xyz") or len(set(axes)) < len(axes):
+                raise ValueError(f'fit: {where}{name} must consist of the letters x, y, z, got "{axes}"')
+        if free.lower is not None and free.upper is not None and not free.lower < free.upper:
+            raise ValueError(f"fit: {where}lower must be below upper, got {free.lower} and {free.upper}")
+
+
+def _at_least(where: str, of: Any, minima: dict[str, float]) -> None:
+    for name, minimum in minima.items():
+        value = getattr(of, name)
+        if value is not None and not value >= minimum:
+            raise ValueError(f"fit: {where}{name} must be >= {minimum}, got {value}")
+
+
+def _positive(where: str, of: Any, names: tuple[str, ...]) -> None:
+    for name in names:
+        value = getattr(of, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise ValueError(f"fit: {where}{name} must be > 0, got {value}")
+
+
+# ------------------------------------------------------------------ files
+
+
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter(forbid_extra_keys=True, omit_if_default=True)
+    converter.register_structure_hook(Path, lambda value, _: Path(value))
+    converter.register_unstructure_hook(Path, Path.as_posix)
+    # "key" may be one name.
+    structure_free = make_dict_structure_fn(Free, converter, _cattrs_forbid_extra_keys=True)
+    one_key = lambda d: {**d, "key": [d["key"]]} if isinstance(d.get("key"), str) else d
+    converter.register_structure_hook(Free, lambda d, kind: structure_free(one_key(d), kind))
+    return converter
+
+
+def read(path: Path | str) -> Problem:
+    """Read a problem from a TOML file. Paths in it are relative to it.
+
+    Raises
+    ------
+    ValueError : it is no TOML file, a key in it is unknown or missing, or has a value that makes no sense. The text is
+        one line.
+    OSError : it cannot be read.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    try:
+        problem = _converter().structure(content, Problem)
+    except cattrs.BaseValidationError as error:
+        raise ValueError(f"{path}: " + "; ".join(cattrs.transform_error(error, "fit", _say))) from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return relative_to(problem, path.parent)
+
+
+def _say(error: BaseException, kind: type | None) -> str:
+    return str(error) if str(error).startswith("fit:") else cattrs.v.format_exception(error, kind)
+
+
+def write(path: Path, problem: Problem) -> None:
+    """Write a problem as `read` reads it, with absolute paths."""
+    path.write_text(text(relative_to(problem, Path.cwd())), "utf-8")
+
+
+def parse(text: str) -> dict[str, Any]:
+    """TOML as a dictionary."""
+    return tomllib.loads(text)
+
+
+def text(problem: Problem) -> str:
+    """A problem as TOML."""
+    return tomli_w.dumps(_without_none(_converter().unstructure(problem)))
+
+
+def relative_to(problem: Problem, folder: Path) -> Problem:
+    """The problem with all paths seen from a folder, absolute."""
+    place = lambda path: None if path is None else (folder / path).resolve()
+    targets = tuple(
+        dataclasses.replace(t, file=place(t.file), scene=place(t.scene), mask=place(t.mask)) for t in problem.target
+    )
+    return dataclasses.replace(problem, scene=place(problem.scene), target=targets)
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_none(v) for k, v in value.items() if v is not None}
+    return [_without_none(v) for v in value] if isinstance(value, list | tuple) else value

@@ -1,0 +1,219 @@
+"""Loss and gradient of one view of a problem, as a pure function of NumPy arrays: what processes and machines share.
+
+The picture is rendered, compared with the target on the host, and the derivative of the loss with respect to its pixels
+weighs a second, independent render, backward. Both are recorded once and replayed (`dr.freeze`) where that is possible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rimlight.loading import load_integrator, load_scene, use_variant
+
+from . import losses, targets
+from .free_parameters import from_flat
+from .problem import Problem
+
+#: Sensors whose renders Dr.Jit cannot replay with Mitsuba 3.9.
+NOT_REPLAYED = ("ThinLensCamera", "OrthographicCamera")
+
+#: Integrators of Mitsuba that can be replayed; ours say so themselves.
+REPLAYED = ("prb", "prb_basic", "path", "direct")
+
+#: Samples of one launch; more are split.
+MAX_SAMPLES = 2**22
+
+
+@dataclass(frozen=True)
+class Task:
+    """One picture to compare, and its gradient.
+
+    target : number of the target. width : of the film, pixels; None: as the scene has it. spp : samples per pixel.
+    seed : of the image; that of the derivative differs from it.
+    """
+
+    target: int
+    width: int | None
+    spp: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """loss : at a render. gradients : key -> as `to_numpy` has the value. image : (H, W, C), what was rendered."""
+
+    loss: float
+    gradients: dict[str, np.ndarray]
+    image: np.ndarray
+
+
+class Renderer:
+    """The scenes and targets of a problem, loaded.
+
+    params : of all scenes, key -> value; where several scenes have a key, that of the first.
+
+    Raises
+    ------
+    ValueError, OSError : scene, integrator or target cannot be loaded, or do not fit together. The text is one line.
+    """
+
+    def __init__(self, problem: Problem):
+        use_variant(problem.variant)
+        self.problem = problem
+        options = dict(problem.integrator)
+        self.integrator = load_integrator(options.pop("type"), **options)
+        define = [f"{key}={value}" for key, value in problem.define.items()]
+        paths = [target.scene or problem.scene for target in problem.target]
+        # Every load of a scene costs memory that never comes back.
+        scenes = {path: load_scene(path, define) for path in dict.fromkeys(paths)}
+        self.views = [View(self, i, scenes[path]) for i, path in enumerate(paths)]
+        self.params = {}
+        for scene in scenes.values():
+            self.params = dict(mi.traverse(scene).items()) | self.params
+
+    def image(self, values: Mapping[str, np.ndarray], task: Task) -> np.ndarray:
+        """A picture: (H, W, C), float32, linear."""
+        view = self.views[task.target]
+        view.set(values, task.width)
+        return view.render(task.seed, task.spp)
+
+    def gradient(self, values: Mapping[str, np.ndarray], task: Task) -> Gradient:
+        """The loss, and its derivative with respect to the values.
+
+        values : key -> array as `to_numpy` makes it; what is not in the scene of this view is ignored.
+        """
+        view = self.views[task.target]
+        leaves = view.set(values, task.width)
+        image = view.render(task.seed, task.spp)
+        target, weight = view.target_at(image.shape[:2])
+        loss, by_pixel = losses.value_and_gradient(self.problem.loss, image, target, weight)
+        view.backward(by_pixel, derived_seed(task.seed), task.spp)
+        gradients = {key: np.array(dr.grad(leaf), np.float32) for key, leaf in leaves.items()}
+        return Gradient(loss, gradients, image)
+
+
+class View:
+    """One target, and the sensor that takes the same picture."""
+
+    def __init__(self, renderer: Renderer, number: int, scene: mi.Scene):
+        self.renderer, self.number, self.scene = renderer, number, scene
+        self.target = renderer.problem.target[number]
+        self.params = mi.traverse(scene)
+        if self.target.sensor >= len(scene.sensors()):
+            raise ValueError(
+                f"fit: target.{number}.sensor: the scene has {len(scene.sensors())} sensors, there is no number "
+                f"{self.target.sensor}"
+            )
+        self.sensor = scene.sensors()[self.target.sensor]
+        self.film = mi.traverse(self.sensor)
+        self.size = tuple(int(n) for n in reversed(self.sensor.film().crop_size()))
+        self.functions: dict[Any, tuple[Callable, Callable]] = {}
+        self.kinds = {}
+        self._picture: tuple[np.ndarray, np.ndarray] | None = None
+
+    # ---------------------- Target ----------------------
+
+    def picture(self) -> tuple[np.ndarray, np.ndarray]:
+        """Target and weights at full size. Without a file, it is rendered now, from the scene as it is."""
+        if self._picture is None:
+            loss = self.renderer.problem.loss
+            if self.target.file is None:
+                self._resize(None)
+                image = self._truth()
+                weight = np.ones(image.shape[:2], np.float32)
+            else:
+                image, weight = targets.read(self.target, self.size)
+            self._picture = image, losses.pixels_that_count(loss, image, weight)
+        return self._picture
+
+    def _truth(self) -> np.ndarray:
+        """Rendered in passes, summed in double precision."""
+        total, spp = 0.0, self.target.spp
+        per_pass = max(min(spp, MAX_SAMPLES // (self.size[0] * self.size[1]), 256), 1)
+        passes = -(-spp // per_pass)
+        for i in range(passes):
+            total = total + np.array(self._image(seed=derived_seed(self.number, i), spp=per_pass), np.float64)
+        return (total / passes).astype(np.float32)
+
+    def target_at(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        image, weight = self.picture()
+        return targets.smaller(image, weight, size)
+
+    # ---------------------- Scene ----------------------
+
+    def set(self, values: Mapping[str, np.ndarray], width: int | None) -> dict[str, mi.Float]:
+        """Set scene parameters and the size of the film. Returns what collects the gradients: key -> flat."""
+        self._resize(width)
+        leaves = {}
+        for key, value in values.items():
+            if key not in self.params:
+                continue
+            if key not in self.kinds:
+                old = self.params[key]
+                self.kinds[key] = type(old), old.shape if dr.is_tensor_v(old) else None
+            # Multiplied, so that it lies in Dr.Jit's own memory: of NumPy's, a replay would see the first numbers only.
+            leaf = mi.Float(value.astype(np.float32).ravel()) * dr.opaque(mi.Float, 1)
+            dr.eval(leaf)
+            dr.enable_grad(leaf)
+            self.params[key] = from_flat(leaf, *self.kinds[key])
+            leaves[key] = leaf
+        self.params.update()
+        return leaves
+
+    def _resize(self, width: int | None) -> None:
+        size = self.size if width is None else (max(round(self.size[0] * width / self.size[1]), 1), width)
+        if size != tuple(reversed(self.sensor.film().crop_size())):
+            self.film["film.size"] = mi.ScalarVector2u(size[1], size[0])
+            self.film.update()
+
+    # ---------------------- Rendering ----------------------
+
+    def render(self, seed: int, spp: int) -> np.ndarray:
+        image, _ = self._functions(spp)
+        return np.array(image(self.scene, self.renderer.integrator, dr.opaque(mi.UInt32, seed)), np.float32)
+
+    def backward(self, by_pixel: np.ndarray, seed: int, spp: int) -> None:
+        _, derivative = self._functions(spp)
+        weight = mi.TensorXf(by_pixel.astype(np.float32)) * dr.opaque(mi.Float, 1)
+        dr.eval(weight)
+        derivative(self.scene, self.renderer.integrator, weight, dr.opaque(mi.UInt32, seed))
+
+    def _image(self, seed: Any, spp: int) -> mi.TensorXf:
+        with dr.suspend_grad():
+            return self.renderer.integrator.render(self.scene, sensor=self.sensor, seed=seed, spp=spp)
+
+    def _functions(self, spp: int) -> tuple[Callable, Callable]:
+        """Image and derivative. Recorded apart for each size of the film, which Dr.Jit does not look at."""
+        key = spp, tuple(self.sensor.film().crop_size())
+        if key not in self.functions:
+            sensor = self.sensor
+
+            def image(scene, integrator, seed):
+                with dr.suspend_grad():
+                    return integrator.render(scene, sensor=sensor, seed=seed, spp=spp)
+
+            def derivative(scene, integrator, weight, seed):
+                integrator.render_backward(scene, mi.traverse(scene), weight, sensor=sensor, seed=seed, spp=spp)
+
+            if self._replays():
+                known = lambda scene, integrator, *_: getattr(integrator, "find_boundaries", lambda scene: None)(scene)
+                self.functions[key] = dr.freeze(image), dr.freeze(derivative, state_fn=known)
+            else:
+                self.functions[key] = image, derivative
+        return self.functions[key]
+
+    def _replays(self) -> bool:
+        renderer = self.renderer
+        possible = hasattr(renderer.integrator, "find_boundaries") or renderer.problem.integrator["type"] in REPLAYED
+        return renderer.problem.freeze and possible and self.sensor.class_name() not in NOT_REPLAYED
+
+
+def derived_seed(*numbers: int) -> int:
+    """A seed for random numbers that are independent of those of other numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
