@@ -25,7 +25,7 @@ test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 # All of them take about half an hour; or one: make bench NAME=scaling
-NAME ?= film_boundary soft_shadow hard_shadow glossy global_illumination scaling rig
+NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illumination scaling rig
 bench: setup
 	for name in $(NAME); do $(BIN)/python tests/benchmarks/bm_$$name.py || exit 1; done
 

@@ -40,7 +40,7 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     OSError : it cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             facts = json.loads(str(file["facts"]))
             arrays = {name.removeprefix("array/"): file[name] for name in file.files if name != "facts"}
     except FileNotFoundError:

@@ -19,7 +19,8 @@ import rimlight
 from rimlight import pictures, scenes
 from rimlight.edge_sampling import Motion, derivative_image, finite_differences
 from rimlight.edge_sampling.exr import replacing
-from rimlight.inverse.triangles import VertexFit, fit_vertices
+from rimlight.inverse.fitting import fit
+from rimlight.inverse.reproduce import problem_of
 
 SPP = 256  # samples per pixel of one derivative
 RENDERS = 4  # derivatives to average; the first one pays for the compiler and is not timed
@@ -75,13 +76,6 @@ STUDIES = (
         2e-3,
     ),
 )
-
-#: The start of the fit: the initial guess of redner's test `two_triangles` (figure 6a of Li et al. 2018), at the depth
-#: of the target. The right vertex of the red triangle is hidden behind the green one.
-START = {
-    "green.vertex_positions": ((-1.3, 1.5, 0.0), (1.5, 0.7, 0.0), (-0.8, -1.1, 0.0)),
-    "red.vertex_positions": ((-0.5, 1.2, 1.0), (0.3, 1.7, 1.0), (0.5, -1.8, 1.0)),
-}
 
 
 @dataclass(frozen=True)
@@ -163,52 +157,31 @@ def _timed(work: Any) -> tuple[Any, float]:
 # ------------------------------------------------------------------ fit
 
 
-def show_fit(out: Path, *, resolution: int = 128, iterations: int = 200) -> Section:
+def show_fit(out: Path) -> Section:
     """Fit the six vertices of two triangles to a picture, and write what became of them."""
     _free()
-    scene = mi.load_file(str(scenes.path("two_triangles")), res=resolution)
-    params = mi.traverse(scene)
-    truth = {key: np.array(params[key]).reshape(-1, 3) for key in START}
-    target = np.array(mi.render(scene, spp=1024, seed=1000))
-    for key, vertices in START.items():
-        params[key] = mi.Float(np.ravel(vertices).astype(np.float32))
-    params.update()
-    before = np.array(mi.render(scene, spp=SPP, seed=1001))
-    fit, seconds = _timed(
-        lambda: fit_vertices(scene, list(START), target, iterations=iterations, axes="xy", final_spp=SPP)
-    )
-
-    errors = vertex_errors(fit, truth, resolution)
-    rmse = [float(np.sqrt(np.mean((image - target) ** 2))) for image in (before, fit.image)]
+    found = fit(problem_of("fig6a"))
+    view, steps = found.views[0], len(found.losses)
+    errors = np.max([e for label, e in found.errors.items() if "farthest" in label], axis=0)
+    rmse = found.measures[0]["root mean square error"]
     panels = [
-        pictures.Panel(before, f"start\nfarthest vertex {errors[0]:.1f} pixels off"),
-        pictures.Panel(fit.image, f"after {iterations} steps\nfarthest vertex {errors[-1]:.2f} pixels off"),
-        pictures.Panel(target, "target"),
-        pictures.Panel(fit.image - target, "result - target", "derivative"),
+        pictures.Panel(view.start, f"start\nfarthest vertex {errors[0]:.2f} units off"),
+        pictures.Panel(view.result, f"after {steps} steps\nfarthest vertex {errors[-1]:.4f} units off"),
+        pictures.Panel(view.target, "target"),
+        pictures.Panel(view.result - view.target, "result - target", "derivative"),
     ]
     pictures.write_panels(out / "fit.png", panels)
-    curves = {"error of the farthest vertex (pixels)": errors, "loss (mean squared difference)": fit.losses}
+    curves = {"error of the farthest vertex (scene units)": errors, "loss (mean squared difference)": found.losses}
     pictures.write_curves(out / "fit_curves.png", curves, x="step", y="")
     text = (
-        f"Two triangles are pulled from a wrong start into the pose that a picture shows, in {iterations} steps of "
-        f"Adam at 4 samples per pixel ({seconds:.0f} s). At the start the right vertex of the red triangle is hidden "
-        "behind the green one; the parts of its edges that can be seen bring it out. The error of the farthest vertex "
-        f"falls from {errors[0]:.1f} to {errors[-1]:.2f} pixels, the root mean square difference of the pictures from "
-        f"{rmse[0]:.4f} to {rmse[1]:.4f}. The loss levels off at the noise of 4 samples. Depth is held: one picture "
-        "tells next to nothing about it."
+        f"Two triangles are pulled from a wrong start into the pose that a picture shows, in {steps} steps of "
+        f"Adam at 4 samples per pixel ({found.seconds:.0f} s). At the start the right vertex of the red triangle is "
+        "hidden behind the green one; the parts of its edges that can be seen bring it out. The error of the farthest "
+        f"vertex falls from {errors[0]:.2f} to {errors[-1]:.4f} scene units, of which the picture shows about 4, the "
+        f"root mean square difference of the pictures from {rmse[0]:.4f} to {rmse[1]:.4f}. The loss levels off at the "
+        "noise of 4 samples. Depth is held: one picture tells next to nothing about it."
     )
     return Section("Six vertices fitted to a picture", text, ("fit.png", "fit_curves.png"))
-
-
-def vertex_errors(fit: VertexFit, truth: dict[str, np.ndarray], resolution: int) -> np.ndarray:
-    """Distance of the farthest vertex from its place in the picture: (iterations + 1,), pixels.
-
-    truth : key -> (V, 3), world space. resolution : width of the picture, pixels.
-    """
-    focal_length = resolution / (2 * np.tan(np.radians(45 / 2)))  # pixels; the camera stands at z = -5
-    film = lambda p: focal_length * p[..., :2] / (p[..., 2:] + 5)
-    distances = [np.linalg.norm(film(fit.history[key]) - film(truth[key]), axis=-1) for key in truth]
-    return np.concatenate(distances, axis=1).max(1)
 
 
 def _free() -> None:

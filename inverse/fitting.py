@@ -59,8 +59,9 @@ class Progress:
     """Where a fit is, and what it has seen; all of it is in a checkpoint.
 
     segment, iteration : place in the plan. step : of all.
-    losses, segments : of each step. errors : label -> one number before each step, and one at the end, if the truth is
-        known. frames : (step, latents) for an animation.
+    losses, segments, times : of each step; the last in seconds, at its end.
+    errors : label -> one number before each step, and one at the end, if the truth is known.
+    frames : (step, latents) for an animation.
     skipped : gradients that were not finite; bad : of them, without a finite one since.
     touched : latents whose gradient was ever not zero.
     best_loss, best : mean of the loss over `WINDOW` steps of the present segment, and the latents then.
@@ -74,6 +75,7 @@ class Progress:
     step: int = 0
     losses: list[float] = field(default_factory=list)
     segments: list[int] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
     errors: dict[str, list[float]] = field(default_factory=dict)
     frames: list[tuple[int, dict[str, np.ndarray]]] = field(default_factory=list)
     skipped: int = 0
@@ -103,11 +105,13 @@ class Fit:
     status : "finished", "interrupted", "out of time", or why it gave up.
     values : key -> result, as `mi.traverse(scene)` has it: flat, a matrix (4, 4), or a tensor.
     latents, start : of each free parameter: name -> array; the result, and where it began.
-    losses, segments : (steps,), loss at a noisy render before each step, and the number of its segment.
+    losses, segments, times : (steps,), loss at a noisy render before each step, the number of its segment, and seconds
+        in the loop at its end.
     errors : label -> (steps + 1,), distance from the truth, where that is known.
     silent : names of parameters whose gradient was always 0: the pictures do not depend on them.
     skipped : steps that were left out because their gradient was not finite.
     seconds : in the loop. views : pictures before and after. measures : of each view, label -> before and after.
+    floors : root mean square error of each view at the truth, where it is known: the noise of the pictures.
     frames : (step, picture of the first view) from start to end.
     """
 
@@ -118,12 +122,14 @@ class Fit:
     start: dict[str, np.ndarray]
     losses: np.ndarray
     segments: np.ndarray
+    times: np.ndarray
     errors: dict[str, np.ndarray]
     silent: list[str]
     skipped: int
     seconds: float
     views: list[ViewOfFit]
     measures: list[dict[str, tuple[float, float]]]
+    floors: list[float]
     frames: list[tuple[int, np.ndarray]]
 
 
@@ -133,6 +139,7 @@ def fit(
     out: Path | str | None = None,
     resume: bool = False,
     executor: Executor | None = None,
+    tensorboard: bool = False,
     progress: bool = True,
 ) -> Fit:
     """Fit the free parameters of a problem to its targets.
@@ -145,6 +152,7 @@ def fit(
         that of a fit that was not interrupted; with several, sums of gradients differ in their last bits, in any two
         runs alike.
     executor : evaluates gradients elsewhere. Default: here, one after the other.
+    tensorboard : write loss and errors into `out` for TensorBoard. Needs the package tensorboardX.
     progress : show a bar on standard error.
 
     Raises
@@ -153,14 +161,20 @@ def fit(
 
     Ctrl-C ends the fit after the present step, with a result; pressed twice, at once.
     """
-    return Run(problem, out=out, resume=resume, executor=executor).finish(progress)
+    return Run(problem, out=out, resume=resume, executor=executor, tensorboard=tensorboard).finish(progress)
 
 
 class Run:
     """A fit under way."""
 
     def __init__(
-        self, problem: Problem, *, out: Path | str | None = None, resume: bool = False, executor: Executor | None = None
+        self,
+        problem: Problem,
+        *,
+        out: Path | str | None = None,
+        resume: bool = False,
+        executor: Executor | None = None,
+        tensorboard: bool = False,
     ):
         self.problem = problem
         self.file = None if out is None else Path(out) / "checkpoint.npz"
@@ -177,10 +191,13 @@ class Run:
         self.plan = [*explored, *map(Segment, problem.stage[1:])]
         self.total = sum(segment.stage.iterations for segment in self.plan)
         self.progress = Progress()
+        self._board = _board(self.file.parent) if tensorboard and self.file is not None else None
         self._stop = False
         self._disk_failed = False
         if resume:
             self._restore()
+            if executor is None:
+                self._prime()
         else:
             self._begin()
             if self.file is not None:
@@ -203,6 +220,7 @@ class Run:
             while now.segment < len(self.plan):
                 self.step()
                 now.seconds = before + time.monotonic() - began
+                now.times.append(now.seconds)
                 bar.update()
                 bar.set_postfix(self._shown(), refresh=False)
                 if now.bad >= self.problem.max_bad:
@@ -226,8 +244,9 @@ class Run:
         attached = [optimiser.values() for optimiser in self.optimisers]
         values = {key: to_numpy(value) for of_one in attached for key, value in of_one.items()}
         tasks = [
-            Task(i, stage.resolution, stage.spp, derived_seed(self.problem.seed, now.step, i))
+            Task(i, stage.resolution, stage.spp, derived_seed(self.problem.seed, now.step, i, part))
             for i in range(len(self.problem.target))
+            for part in range(self.problem.parts)
         ]
         found = self.executor(values, tasks)
         loss = float(np.mean([f.loss for f in found]))
@@ -246,6 +265,10 @@ class Run:
         else:
             now.skipped += 1
             now.bad += 1
+        if self._board is not None:
+            self._board.add_scalar("loss", loss, now.step)
+            for label, errors in now.errors.items():
+                self._board.add_scalar(label, errors[-1], now.step)
         now.step += 1
         now.iteration += 1
         if now.step == WINDOW:
@@ -287,10 +310,13 @@ class Run:
 
     def _next_segment(self) -> None:
         now, segment = self.progress, self.plan[self.progress.segment]
-        if segment.start is not None:
-            now.found.append((float(np.mean(now.losses[-min(WINDOW, now.iteration) :])), self._latents()))
         last = now.segment == len(self.plan) - 1
-        if last and now.best:
+        if segment.start is not None:
+            loss = float(np.mean(now.losses[-min(WINDOW, now.iteration) :]))
+            now.found.append((loss if np.isfinite(loss) else float("inf"), self._latents()))
+            if last:
+                self._restart_at_best_start()
+        elif last and now.best:
             self._restart(now.best)
         now.segment += 1
         now.iteration = 0
@@ -304,8 +330,11 @@ class Run:
         if segment.start is not None:
             self._restart(self._start(segment.start))
         elif now.found:
-            self._restart(min(now.found, key=lambda entry: entry[0])[1])
+            self._restart_at_best_start()
             now.found = []
+
+    def _restart_at_best_start(self) -> None:
+        self._restart(min(self.progress.found, key=lambda entry: entry[0])[1])
 
     def _start(self, number: int) -> dict[str, np.ndarray]:
         if number == 0:
@@ -394,17 +423,24 @@ class Run:
         for optimiser in self.optimisers:
             optimiser.restore(part("optimiser/"))
 
+    def _prime(self) -> None:
+        """Our integrators arrange the edges in a tree when they first see them, on which their random samples depend:
+        let that be where the fit began, as it was without interruption."""
+        stage, values = self.problem.stage[0], self._values(self.start)
+        for i in range(len(self.problem.target)):
+            self.renderer.gradient(values, Task(i, stage.resolution, stage.spp, 0))
+
     # ---------------------- Result ----------------------
 
     def _result(self, status: str) -> Fit:
         now = self.progress
-        if status != "finished" and now.best:
-            self._restart(now.best)
+        if status != "finished" and (seen := [*now.found, *([(now.best_loss, now.best)] if now.best else [])]):
+            self._restart(min(seen, key=lambda entry: entry[0])[1])
         latents = self._latents()
         self._note_errors(latents)
         values = self._values(latents)
         spp = lambda view: max(1, min(FINAL_SPP, 2**22 // (view.size[0] * view.size[1])))
-        views, measures = [], []
+        views, measures, floors = [], [], []
         for i, view in enumerate(self.renderer.views):
             task = Task(i, None, spp(view), derived_seed(self.problem.seed, 2**31, i))
             before, after = (self.renderer.image(v, task) for v in (self._values(self.start), values))
@@ -412,6 +448,9 @@ class Run:
             views.append(ViewOfFit(before, after, target, weight))
             compared = [losses.measures(image, target, weight) for image in (before, after)]
             measures.append({label: (compared[0][label], compared[1][label]) for label in compared[0]})
+            if self.truth_is_known:
+                again = self.renderer.image(self._values(self._truth()), task)
+                floors.append(losses.root_mean_square(again - target, weight))
         small = Task(0, min(self.renderer.views[0].size[1], 256), 32, derived_seed(self.problem.seed, 2**31 + 1))
         steps = [*now.frames, (now.step, latents)]
         frames = [(step, self.renderer.image(self._values(at), small)) for step, at in steps]
@@ -424,18 +463,33 @@ class Run:
             start=self.start,
             losses=np.array(now.losses),
             segments=np.array(now.segments),
+            times=np.array(now.times),
             errors={label: np.array(errors) for label, errors in now.errors.items()},
             silent=self.silent() if now.step else [],
             skipped=now.skipped,
             seconds=now.seconds,
             views=views,
             measures=measures,
+            floors=floors,
             frames=frames,
         )
+
+    def _truth(self) -> dict[str, np.ndarray]:
+        return {name: latent for p in self.parameters for name, latent in p.truth.items()}
 
     def _values(self, latents: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         held = {name: mi.Float(latent) for name, latent in latents.items()}
         return {key: to_numpy(value) for p in self.parameters for key, value in p.values(held).items()}
+
+
+def _board(folder: Path) -> Any:
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise ValueError(
+            "fit: a log for TensorBoard needs the package tensorboardX: pip install tensorboardX"
+        ) from None
+    return SummaryWriter(str(folder))
 
 
 def parameters_of(fit: Fit) -> list[Parameter]:
@@ -454,6 +508,7 @@ def summary(fit: Fit) -> str:
             "no influence": fit.silent,
             "errors": {label: [float(e[0]), float(e[-1])] for label, e in fit.errors.items()},
             "pictures": fit.measures,
+            "noise of the pictures": fit.floors,
             "values": {key: value.ravel().tolist() for key, value in fit.values.items() if value.size <= 64},
         },
         indent=2,

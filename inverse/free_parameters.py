@@ -57,10 +57,12 @@ class Parameter(ABC):
 
     def scatter(self, rng: np.random.Generator, move: float, turn: float, value: float) -> dict[str, np.ndarray]:
         """A start elsewhere: normally distributed around the one that was asked for."""
-        return {
-            name: self.legal(name, (start + value * rng.standard_normal(start.shape)).astype(np.float32))
-            for name, start in self.start.items()
-        }
+        found = {}
+        for name, start in self.start.items():
+            mask = self.mask(name)
+            change = value * rng.standard_normal(start.shape) * (1 if mask is None else mask)
+            found[name] = self.legal(name, (start + change).astype(np.float32))
+        return found
 
     def errors(self, latents: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Distance from the truth, by a label with its unit."""
@@ -90,7 +92,7 @@ class RigidBody(Parameter):
         shift, rotation = (dr.unravel(mi.Vector3f, latents[k]) for k in (self.move, self.turn))
         moved = rotate_and_shift(rotation, shift, mi.Point3f(self.centre))
         return {
-            key: moved @ value if _is_transform(value) else dr.ravel(moved @ dr.unravel(mi.Point3f, value))
+            key: moved @ value if is_transform(value) else dr.ravel(moved @ dr.unravel(mi.Point3f, value))
             for key, value in self.initial.items()
         }
 
@@ -129,7 +131,9 @@ class Vertices(Parameter):
         place = np.array(initial, np.float32).reshape(-1, 3)
         _, first, weld = np.unique(place, axis=0, return_index=True, return_inverse=True)
         self.first, self.weld = first, mi.UInt(weld.ravel())
-        self.chosen = self._chosen(len(place))[first].ravel()
+        chosen = np.zeros((len(first), 3), np.float32)
+        np.maximum.at(chosen, weld.ravel(), self._chosen(len(place)))  # who moves one of a place, moves all
+        self.chosen = chosen.ravel()
         offset = (
             _numbers(free.start, {3, place.size}, name, f"3 or {place.size} numbers") if free.start else np.zeros(3)
         )
@@ -190,6 +194,7 @@ class Values(Parameter):
                 f'fit: "{key}" starts outside of its legal range {self.low} … {self.high}; '
                 "set lower and upper if that is meant"
             )
+        self.start[key] = self.legal(key, self.start[key])
 
     def values(self, latents):
         return {self.key: from_flat(latents[self.key], self.kind, self.shape)}
@@ -229,7 +234,7 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
                 raise ValueError(f'fit: "{key}" is free twice')
             seen.add(key)
         moves_whole = lambda key, kind=entry.kind: (
-            _is_transform(params[key]) or (kind == "pose" and key.endswith("vertex_positions"))
+            is_transform(params[key]) or (kind == "pose" and key.endswith("vertex_positions"))
         )
         rigid = [key for key in entry.key if moves_whole(key)]
         if rigid:
@@ -253,7 +258,7 @@ def _check_key(key: str, params: Any) -> None:
             f'fit: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
         )
     value = params[key]
-    if not _is_transform(value) and not (dr.is_diff_v(value) and dr.is_float_v(value)):
+    if not is_transform(value) and not (dr.is_diff_v(value) and dr.is_float_v(value)):
         raise ValueError(f'fit: "{key}" is of type {type(value).__name__}, which has no derivative')
 
 
@@ -263,7 +268,7 @@ def _check_key(key: str, params: Any) -> None:
 def to_numpy(value: Any) -> np.ndarray:
     """A scene parameter as float32: a matrix (4, 4), a tensor in its shape, else flat."""
     value = dr.detach(value)
-    if _is_transform(value):
+    if is_transform(value):
         return np.array(value.matrix, np.float32).reshape(4, 4)
     return np.array(value if dr.is_tensor_v(value) else dr.ravel(value), np.float32)
 
@@ -300,8 +305,9 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(np.asarray(vector, np.float64)).as_matrix()
 
 
-def _is_transform(value: Any) -> bool:
-    return hasattr(value, "matrix") and hasattr(value, "inverse")
+def is_transform(value: Any) -> bool:
+    # Vectors have an attribute "matrix", too: Dr.Jit takes the letters for a swizzle.
+    return _is_transform_type(type(value))
 
 
 def _is_transform_type(kind: type) -> bool:
@@ -310,7 +316,7 @@ def _is_transform_type(kind: type) -> bool:
 
 def _points(value: Any) -> np.ndarray:
     """Points of a body, (N, 3), world space: vertices, or the origin of a frame."""
-    if _is_transform(value):
+    if is_transform(value):
         return to_numpy(value)[None, :3, 3]
     return to_numpy(value).reshape(-1, 3)
 

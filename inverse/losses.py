@@ -83,6 +83,11 @@ def pixels_that_count(loss: Loss, target: np.ndarray, weight: np.ndarray) -> np.
     return np.where((target > loss.exclude_above).any(axis=2), 0, weight)
 
 
+def root_mean_square(difference: np.ndarray, weight: np.ndarray) -> float:
+    """Of a picture, (H, W, C), over the pixels that count: weight (H, W)."""
+    return float(np.sqrt(np.sum(weight * np.square(difference).mean(2)) / max(weight.sum(), 1e-12)))
+
+
 def measures(image: np.ndarray, target: np.ndarray, weight: np.ndarray) -> dict[str, float]:
     """How alike two pictures are, for people: root mean square error, structural similarity, and the mean colour
     difference ΔE of CIE 2000, where there is colour.
@@ -94,7 +99,7 @@ def measures(image: np.ndarray, target: np.ndarray, weight: np.ndarray) -> dict[
     from rimlight import pictures
 
     share = weight / max(weight.sum(), 1e-12)
-    found = {"root mean square error": float(np.sqrt(np.sum(share * np.square(image - target).mean(2))))}
+    found = {"root mean square error": root_mean_square(image - target, weight)}
     shown, wanted = (pictures.to_srgb(a) for a in (image, target))
     if min(image.shape[:2]) >= 7:
         _, similarity = structural_similarity(shown, wanted, channel_axis=2, full=True)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .free_parameters import Parameter
+from .free_parameters import Parameter, is_transform
 from .problem import Problem
 
 #: Gradients whose lengths clipping remembers.
@@ -101,7 +101,7 @@ class Optimiser:
 
 def inner_product(value: Any, numbers: np.ndarray) -> mi.Float:
     """Of a scene parameter, attached, and numbers in the order of `to_numpy`, flat."""
-    if hasattr(value, "matrix"):
+    if is_transform(value):
         return sum((value.matrix[i, j] * float(numbers[4 * i + j]) for i in range(4) for j in range(4)), mi.Float(0))
     flat = value.array if dr.is_tensor_v(value) else dr.ravel(value)
     return dr.sum(flat * mi.Float(numbers))

@@ -11,6 +11,10 @@ from typing import Any, Literal
 import cattrs
 import tomli_w
 from cattrs.gen import make_dict_structure_fn
+from cattrs.strategies import configure_union_passthrough
+
+from rimlight.edge_sampling.exr import replacing
+from rimlight.loading import InputError
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -18,6 +22,7 @@ else:
     import tomli as tomllib
 
 Kind = Literal["pose", "material", "light", "shape"]
+Value = str | bool | int | float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +139,7 @@ class Problem:
     """One after the other."""
     starts: Starts = Starts()
     """Where to begin."""
-    integrator: dict[str, Any] = dataclasses.field(default_factory=lambda: {"type": "prb_edge"})
+    integrator: dict[str, Value] = dataclasses.field(default_factory=lambda: {"type": "prb_edge"})
     """Plugin that renders and differentiates, with its parameters."""
     optimiser: Literal["adam", "sgd"] = "adam"
     """Mitsuba's. With sgd, `rate` is a factor of the gradient, not a length."""
@@ -144,6 +149,9 @@ class Problem:
     """The second decay rate of adam."""
     clip: float | None = None
     """Longest gradient of one parameter, as a multiple of the median of its last 50 lengths."""
+    parts: int = 1
+    """Independent renders of each target in a step, whose losses and gradients are averaged: work for several
+    processes or machines."""
     seed: int = 0
     """Of all random numbers."""
     patience: int | None = None
@@ -169,23 +177,23 @@ def check(problem: Problem) -> None:
 
     Raises
     ------
-    ValueError : a number is out of range, or something is missing. The text names it as the TOML file does.
+    InputError : a number is out of range, or something is missing. The text names it as the TOML file does.
     """
     if not problem.free:
-        raise ValueError("fit: nothing is free, add a table [[free]]")
+        raise InputError("fit: nothing is free, add a table [[free]]")
     if not problem.target or not problem.stage:
-        raise ValueError("fit: a fit needs at least one target and one stage")
-    at_least = {"seed": 0, "max_bad": 1, "patience": 1, "seconds": 0, "clip": 0}
+        raise InputError("fit: a fit needs at least one target and one stage")
+    at_least = {"parts": 1, "seed": 0, "max_bad": 1, "patience": 1, "seconds": 0, "clip": 0}
     _at_least("", problem, at_least)
     for name in ("momentum", "smooth_scale"):
         if not 0 <= getattr(problem, name) < 1:
-            raise ValueError(f"fit: {name} must be in [0, 1), got {getattr(problem, name)}")
+            raise InputError(f"fit: {name} must be in [0, 1), got {getattr(problem, name)}")
     if "type" not in problem.integrator:
-        raise ValueError('fit: integrator needs a "type"')
+        raise InputError('fit: integrator needs a "type"')
     _at_least("loss.", problem.loss, {"pyramid": 0, "exclude_above": 0})
     _at_least("starts.", problem.starts, {"count": 1, "move": 0, "turn": 0, "value": 0})
     if problem.starts.count > 1 and not (problem.starts.move or problem.starts.turn or problem.starts.value):
-        raise ValueError(
+        raise InputError(
             "fit: several starts need starts.move, starts.turn or starts.value, else they are all the same"
         )
     for i, stage in enumerate(problem.stage):
@@ -196,36 +204,48 @@ def check(problem: Problem) -> None:
     for i, free in enumerate(problem.free):
         where = f"free.{i}."
         if not free.key:
-            raise ValueError(f"fit: {where}key is empty")
+            raise InputError(f"fit: {where}key is empty")
         _positive(where, free, ("rate", "turn_rate"))
         _at_least(where, free, {"smoothing": 0})
         for name in ("move", "turn"):
             axes = getattr(free, name)
             if set(axes) - set("xyz") or len(set(axes)) < len(axes):
-                raise ValueError(f'fit: {where}{name} must consist of the letters x, y, z, got "{axes}"')
+                raise InputError(f'fit: {where}{name} must consist of the letters x, y, z, got "{axes}"')
         if free.lower is not None and free.upper is not None and not free.lower < free.upper:
-            raise ValueError(f"fit: {where}lower must be below upper, got {free.lower} and {free.upper}")
+            raise InputError(f"fit: {where}lower must be below upper, got {free.lower} and {free.upper}")
 
 
 def _at_least(where: str, of: Any, minima: dict[str, float]) -> None:
     for name, minimum in minima.items():
         value = getattr(of, name)
         if value is not None and not value >= minimum:
-            raise ValueError(f"fit: {where}{name} must be >= {minimum}, got {value}")
+            raise InputError(f"fit: {where}{name} must be >= {minimum}, got {value}")
 
 
 def _positive(where: str, of: Any, names: tuple[str, ...]) -> None:
     for name in names:
         value = getattr(of, name)
         if value is not None and not 0 < value < float("inf"):
-            raise ValueError(f"fit: {where}{name} must be > 0, got {value}")
+            raise InputError(f"fit: {where}{name} must be > 0, got {value}")
 
 
 # ------------------------------------------------------------------ files
 
 
+#: Type of a field -> its name for people, and what a file may say.
+EXACT: dict[type, tuple[str, tuple[type, ...]]] = {
+    bool: ("true or false", (bool,)),
+    int: ("a whole number", (int,)),
+    float: ("a number", (int, float)),
+    str: ("a text", (str, int, float)),  # `define` may hold numbers
+}
+
+
 def _converter() -> cattrs.Converter:
     converter = cattrs.Converter(forbid_extra_keys=True, omit_if_default=True)
+    configure_union_passthrough(Value, converter)
+    for kind, (told, allowed) in EXACT.items():
+        converter.register_structure_hook(kind, _exactly(told, allowed))
     converter.register_structure_hook(Path, lambda value, _: Path(value))
     converter.register_unstructure_hook(Path, Path.as_posix)
     # "key" may be one name.
@@ -233,6 +253,17 @@ def _converter() -> cattrs.Converter:
     one_key = lambda d: {**d, "key": [d["key"]]} if isinstance(d.get("key"), str) else d
     converter.register_structure_hook(Free, lambda d, kind: structure_free(one_key(d), kind))
     return converter
+
+
+def _exactly(told: str, allowed: tuple[type, ...]) -> Any:
+    """Structures values of TOML without the conversions of Python, to which "false" is true and 2.7 is 2."""
+
+    def structure(value: Any, kind: type) -> Any:
+        if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
+            raise ValueError(f"fit: expected {told}, got {value!r}")
+        return kind(value)
+
+    return structure
 
 
 def read(path: Path | str) -> Problem:
@@ -246,16 +277,22 @@ def read(path: Path | str) -> Problem:
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: {error}") from None
-    try:
-        problem = _converter().structure(content, Problem)
-    except cattrs.BaseValidationError as error:
-        raise ValueError(f"{path}: " + "; ".join(cattrs.transform_error(error, "fit", _say))) from None
+        problem = from_text(path.read_text("utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return relative_to(problem, path.parent)
+
+
+def from_text(text: str) -> Problem:
+    """Read a problem from TOML. Raises ValueError, as `read` does."""
+    tables = parse(text)
+    for name in ("target", "free", "stage"):
+        if isinstance(tables.get(name), dict):
+            raise ValueError(f"fit: there may be several of {name}, write [[{name}]] instead of [{name}]")
+    try:
+        return _converter().structure(tables, Problem)
+    except cattrs.BaseValidationError as error:
+        raise ValueError("; ".join(cattrs.transform_error(error, "fit", _say))) from None
 
 
 def _say(error: BaseException, kind: type | None) -> str:
@@ -264,7 +301,8 @@ def _say(error: BaseException, kind: type | None) -> str:
 
 def write(path: Path, problem: Problem) -> None:
     """Write a problem as `read` reads it, with absolute paths."""
-    path.write_text(text(relative_to(problem, Path.cwd())), "utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(text(relative_to(problem, Path.cwd())), "utf-8")
 
 
 def parse(text: str) -> dict[str, Any]:

@@ -92,6 +92,10 @@ class Renderer:
         leaves = view.set(values, task.width)
         image = view.render(task.seed, task.spp)
         target, weight = view.target_at(image.shape[:2])
+        if target.shape[2] not in (1, image.shape[2]):
+            raise ValueError(
+                f"fit: target.{task.target}: the picture has {target.shape[2]} channels, the film {image.shape[2]}"
+            )
         loss, by_pixel = losses.value_and_gradient(self.problem.loss, image, target, weight)
         view.backward(by_pixel, derived_seed(task.seed), task.spp)
         gradients = {key: np.array(dr.grad(leaf), np.float32) for key, leaf in leaves.items()}
@@ -112,6 +116,8 @@ class View:
             )
         self.sensor = scene.sensors()[self.target.sensor]
         self.film = mi.traverse(self.sensor)
+        #: The last channel of the film, which is not compared.
+        self.alpha = mi.has_flag(self.sensor.film().flags(), mi.FilmFlags.Alpha)
         self.size = tuple(int(n) for n in reversed(self.sensor.film().crop_size()))
         self.functions: dict[Any, tuple[Callable, Callable]] = {}
         self.kinds = {}
@@ -139,7 +145,7 @@ class View:
         passes = -(-spp // per_pass)
         for i in range(passes):
             total = total + np.array(self._image(seed=derived_seed(self.number, i), spp=per_pass), np.float64)
-        return (total / passes).astype(np.float32)
+        return self._colours(total / passes)
 
     def target_at(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         image, weight = self.picture()
@@ -149,6 +155,8 @@ class View:
 
     def set(self, values: Mapping[str, np.ndarray], width: int | None) -> dict[str, mi.Float]:
         """Set scene parameters and the size of the film. Returns what collects the gradients: key -> flat."""
+        for view in self.renderer.views:
+            view.picture()  # while the scenes still are as their files have them
         self._resize(width)
         leaves = {}
         for key, value in values.items():
@@ -176,10 +184,15 @@ class View:
 
     def render(self, seed: int, spp: int) -> np.ndarray:
         image, _ = self._functions(spp)
-        return np.array(image(self.scene, self.renderer.integrator, dr.opaque(mi.UInt32, seed)), np.float32)
+        return self._colours(np.array(image(self.scene, self.renderer.integrator, dr.opaque(mi.UInt32, seed))))
+
+    def _colours(self, image: np.ndarray) -> np.ndarray:
+        return (image[..., :-1] if self.alpha else image).astype(np.float32)
 
     def backward(self, by_pixel: np.ndarray, seed: int, spp: int) -> None:
         _, derivative = self._functions(spp)
+        if self.alpha:
+            by_pixel = np.concatenate([by_pixel, np.zeros_like(by_pixel[..., :1])], axis=2)
         weight = mi.TensorXf(by_pixel.astype(np.float32)) * dr.opaque(mi.Float, 1)
         dr.eval(weight)
         derivative(self.scene, self.renderer.integrator, weight, dr.opaque(mi.UInt32, seed))
@@ -202,7 +215,8 @@ class View:
                 integrator.render_backward(scene, mi.traverse(scene), weight, sensor=sensor, seed=seed, spp=spp)
 
             if self._replays():
-                known = lambda scene, integrator, *_: getattr(integrator, "find_boundaries", lambda scene: None)(scene)
+                nothing = lambda scene, sensor: None
+                known = lambda scene, integrator, *_: getattr(integrator, "find_boundaries", nothing)(scene, sensor)
                 self.functions[key] = dr.freeze(image), dr.freeze(derivative, state_fn=known)
             else:
                 self.functions[key] = image, derivative

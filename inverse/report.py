@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 import rimlight
 from rimlight import pictures
 from rimlight.edge_sampling.exr import replacing, write_exr
-from rimlight.sys_info import _processor
+from rimlight.sys_info import processor
 
 from . import fitting, page
 from . import problem as problems
@@ -246,7 +246,7 @@ def _settings(fit: Fit) -> str:
         "NumPy": np.__version__,
         "Python": platform.python_version(),
         "threads": str(dr.thread_count()),
-        "processor": _processor(),
+        "processor": processor(),
         "date": datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         "time taken": f"{fit.seconds:.1f} s, without the start and the pictures of this page",
     }

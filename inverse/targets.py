@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 from skimage.transform import downscale_local_mean, resize
 
 from rimlight.edge_sampling.exr import read_exr
+from rimlight.loading import one_line
 
 from .problem import Target
 
@@ -24,28 +26,40 @@ def read(target: Target, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
 
     Raises
     ------
-    ValueError : the picture is not finite, has another size and `resize` is off, contradicts its `colour`, or has no
-        alpha channel though `alpha` is on.
+    ValueError : a pixel that counts is not finite; or the picture has another size and `resize` is off, contradicts
+        its `colour`, or has no alpha channel though `alpha` is on.
     OSError : a file cannot be read.
     """
     assert target.file is not None
     image, encoded = read_picture(target.file)
     colour = ("srgb" if encoded else "linear") if target.colour == "auto" else target.colour
     who = f'fit: target "{target.file.name}"'
-    if not np.isfinite(image).all():
-        bad = int((~np.isfinite(image)).any(axis=2).sum())
-        raise ValueError(f"{who} has {bad} pixels that are not finite; repair it, or exclude them by a mask")
-    if colour == "srgb" and not encoded and image.max() > 1:
-        raise ValueError(f'{who} has values up to {image.max():.3g}: it cannot be sRGB, set its colour to "linear"')
+    largest = np.max(image, where=np.isfinite(image), initial=0)
+    if colour == "srgb" and not encoded and largest > 1:
+        raise ValueError(f'{who} has values up to {largest:.3g}: it cannot be sRGB, set its colour to "linear"')
     if colour == "linear" and target.file.suffix.lower() in (".jpg", ".jpeg"):
         raise ValueError(f'{who}: JPEG files are never linear, set its colour to "srgb"')
     weight = np.ones(image.shape[:2], np.float32)
     if image.shape[2] in (2, 4):
         if target.alpha:
-            weight = np.clip(image[:, :, -1], 0, 1)
+            weight = np.clip(np.nan_to_num(image[:, :, -1]), 0, 1)
         image = image[:, :, :-1]
     elif target.alpha:
         raise ValueError(f"{who} has no alpha channel")
+    if target.mask is not None:
+        mask, _ = read_picture(target.mask)
+        if mask.shape[:2] != image.shape[:2]:
+            if not target.resize:
+                raise ValueError(
+                    f'fit: mask "{target.mask.name}" has {mask.shape[1]} x {mask.shape[0]} pixels, '
+                    f"the picture {image.shape[1]} x {image.shape[0]}"
+                )
+            mask = resample(mask, image.shape[:2])
+        weight = weight * np.clip(mask[:, :, 0], 0, 1)
+    bad = (weight > 0) & ~np.isfinite(image).all(axis=2)
+    if bad.any():
+        raise ValueError(f"{who} has {bad.sum()} pixels that are not finite; repair it, or exclude them by a mask")
+    image = np.where(weight[..., None] > 0, image, np.float32(0))
     if colour == "srgb":
         image = srgb_to_linear(image)
     if image.shape[:2] != size:
@@ -54,17 +68,7 @@ def read(target: Target, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
                 f"{who} has {image.shape[1]} x {image.shape[0]} pixels, the film {size[1]} x {size[0]}; "
                 "set resize to resample it"
             )
-        image, weight = resample(image, size), resample(weight, size)
-    if target.mask is not None:
-        mask, _ = read_picture(target.mask)
-        if mask.shape[:2] != size:
-            if not target.resize:
-                raise ValueError(
-                    f'fit: mask "{target.mask.name}" has {mask.shape[1]} x {mask.shape[0]} pixels, '
-                    f"the film {size[1]} x {size[0]}"
-                )
-            mask = resample(mask, size)
-        weight = weight * np.clip(mask[:, :, 0], 0, 1)
+        image, weight = smaller(image, weight, size)
     if not weight.any():
         raise ValueError(f"{who}: no pixel counts, mask and alpha are 0 everywhere")
     return image.astype(np.float32), weight.astype(np.float32)
@@ -80,9 +84,10 @@ def read_picture(path: Path) -> tuple[np.ndarray, bool]:
     from skimage import io
 
     try:
-        image = np.asarray(io.imread(path))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise OSError(f'fit: cannot read "{path}": {error}') from None
+        # scikit-image reads colours of 16 bits as 8.
+        image = np.asarray(mi.Bitmap(str(path)) if path.suffix.lower() == ".png" else io.imread(path))
+    except (OSError, ValueError, SyntaxError, RuntimeError) as error:
+        raise OSError(f'fit: cannot read "{path}": {one_line(error)}') from None
     if image.ndim == 2:
         image = image[:, :, None]
     if image.ndim != 3 or not np.issubdtype(image.dtype, np.unsignedinteger):
@@ -98,7 +103,7 @@ def srgb_to_linear(image: np.ndarray) -> np.ndarray:
 
 
 def smaller(image: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """A target for a film of fewer pixels: (H, W, C) and (H, W). What does not count stays out."""
+    """A target for a film of another size: (H, W, C) and (H, W). What does not count stays out."""
     if image.shape[:2] == size:
         return image, weight
     share = resample(weight, size)

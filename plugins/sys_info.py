@@ -48,7 +48,7 @@ def sys_info() -> dict[str, Any]:
             **{name: _version(distribution) for name, distribution in PACKAGES.items()},
         },
         "system": platform.platform(),
-        "processor": _processor(),
+        "processor": processor(),
         "threads": dr.thread_count(),
         "llvm": llvm and {"path": llvm.path, "version": ".".join(map(str, llvm.version)), "origin": llvm.origin},
         "variants": list(mi.variants()),
@@ -90,7 +90,7 @@ def _version(distribution: str) -> str:
         return "not installed"
 
 
-def _processor() -> str:
+def processor() -> str:
     """Marketing name of the processor, where the system tells it."""
     try:
         if platform.system() == "Linux":

@@ -2,15 +2,18 @@
 
 `exact` is checked on charts: one scene with a cell of the film for each row, whose derivative is compared with finite
 differences cell by cell; or it names cases of `test_derivatives.py`. `warned` and `refused` are checked by the message.
-To add a row: a line in the document, and an entry in `CELLS`, `MESSAGES` or `ELSEWHERE`.
+To add a row: a line in the document, and an entry in `CELLS`, `MESSAGES` or `ELSEWHERE`. Finite differences are stored;
+``RENEW_REFERENCES=1 python -m pytest tests/test_support.py`` makes them anew (a few minutes).
 """
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -24,6 +27,7 @@ import pytest
 
 from rimlight.edge_sampling import (
     EdgeKind,
+    FiniteDifferences,
     Geometry,
     Motion,
     derivative_image,
@@ -37,6 +41,17 @@ from rimlight.edge_sampling import (
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "support.md"
 WORDS = ("exact", "warned", "refused", "silent", "untested", "—")
 COLUMNS = {"moves": "moves", "changes": "changes", "is passed": "passed", "sees something move": "passed"}
+
+
+def reference(name: str, of: Sequence[str], scene: mi.Scene, motion: Any, **options: Any) -> FiniteDifferences:
+    """Stored finite differences. of : what they are of, in words that must not have changed since."""
+    file = cases.REFERENCES / f"support_{name}.exr"
+    of = json.dumps([*of, sorted(map(str, options.items()))])
+    if os.environ.get("RENEW_REFERENCES"):
+        finite_differences(scene, motion, runs=6, **options).write(file, {"of": of})
+    found = FiniteDifferences.read(file)
+    assert found.settings["of"] == of, f"{file.name} is of something else: make it anew, see above"
+    return found
 
 
 @pytest.fixture(autouse=True)
@@ -277,6 +292,7 @@ class Chart:
 
     def __init__(self, column: str, folder: Path):
         self.names = [name for name, c in ON_CHARTS if c == column]
+        self.column = column
         self.columns = int(np.ceil(np.sqrt(len(self.names))))
         self.lines = -(-len(self.names) // self.columns)
         T = mi.ScalarTransform4f
@@ -330,19 +346,19 @@ class Chart:
     @cache  # noqa: B019 (a chart lives as long as the file's tests)
     def measure(self):
         """Mean derivative and its standard error, and the finite differences."""
-        reference = finite_differences(self.scene, self.motion, step=self.step, runs=6, spp=1024)
+        expected = reference(f"chart_{self.column}", self.names, self.scene, self.motion, step=self.step, spp=1024)
         integrator = mi.load_dict({"type": "direct_edge"})
         images = [derivative_image(self.scene, integrator, self.motion, spp=128, seed=100 + i) for i in range(16)]
-        return *mean_and_error(np.array(images, np.float64)), reference
+        return *mean_and_error(np.array(images, np.float64)), expected
 
     def compare(self, name: str) -> tuple[float, float, float]:
         """Relative L1 error in the cell of a row, how much of it is noise, and the largest |z|."""
-        mean, error, reference = self.measure()
+        mean, error, stored = self.measure()
         k = self.names.index(name)
         i, j = PIXELS * (k % self.columns), PIXELS * (k // self.columns)
         part = lambda a: a[j : j + PIXELS, i : i + PIXELS]
         mean, error, expected, its_error, step_error = map(
-            part, (mean, error, reference.mean, reference.standard_error, reference.step_error)
+            part, (mean, error, stored.mean, stored.standard_error, stored.step_error)
         )
         total = np.abs(expected).sum()
         if total == 0:  # what is invisible changes nothing
@@ -470,18 +486,19 @@ def light_images(trio: tuple[str, ...], column: str):
             elif in_light(row, column):
                 motions.append(Motion(scene, f"lamp{i}.{changes}", direction=[1]))
     motion, integrator = Together(tuple(motions)), mi.load_dict({"type": "direct_edge"})
-    reference = finite_differences(scene, motion, step=0.1 if column == "changes" else 6e-3, runs=6, spp=1024)
+    name = re.sub(r"\W+", "_", "_".join([*trio, column])).strip("_")
+    expected = reference(name, trio, scene, motion, step=0.1 if column == "changes" else 6e-3, spp=1024)
     images = [derivative_image(scene, integrator, motion, spp=256, seed=100 + i) for i in range(8)]
-    return *mean_and_error(np.array(images, np.float64)), reference
+    return *mean_and_error(np.array(images, np.float64)), expected
 
 
 @pytest.mark.parametrize(("row", "column"), IN_LIGHT)
 def test_exact_in_this_light(variant, row, column):
     trio = next(t for t in TRIOS if row in t)
-    mean, error, reference = light_images(trio, column)
+    mean, error, stored = light_images(trio, column)
     channels = slice(None) if len(trio) == 1 else [trio.index(row)]
     mean, error, expected, its_error, step_error = (
-        a[..., channels] for a in (mean, error, reference.mean, reference.standard_error, reference.step_error)
+        a[..., channels] for a in (mean, error, stored.mean, stored.standard_error, stored.step_error)
     )
     total = np.abs(expected).sum()
     noise = np.sqrt(2 / np.pi) * np.hypot(error, its_error).sum() / total
@@ -592,26 +609,26 @@ def test_something_passes_an_instance():
     assert np.abs(images[0] - images[1]).sum() < 0.25 * np.abs(images[1]).sum()
 
 
-def assert_exact(scene: mi.Scene, key: str, step: float = 5e-3, spp: int = 128, **motion) -> None:
-    """Against finite differences."""
+def assert_exact(name: str, scene: mi.Scene, key: str, step: float = 5e-3, spp: int = 128, **motion) -> None:
+    """Against finite differences. name : of the reference."""
     motion = Motion(scene, key, **(motion or SIDEWAYS))
-    reference = finite_differences(scene, motion, step=step, runs=6, spp=8 * spp)
+    expected = reference(name, [str(motion)], scene, motion, step=step, spp=8 * spp)
     it = mi.load_dict({"type": "direct_edge"})
     images = np.array([derivative_image(scene, it, motion, spp=spp, seed=100 + i) for i in range(8)], np.float64)
     mean, error = mean_and_error(images)
-    total = np.abs(reference.mean).sum()
-    noise = np.sqrt(2 / np.pi) * np.hypot(error, reference.standard_error).sum() / total
-    z = z_scores(mean, error, reference.mean, reference.standard_error, reference.step_error)
+    total = np.abs(expected.mean).sum()
+    noise = np.sqrt(2 / np.pi) * np.hypot(error, expected.standard_error).sum() / total
+    z = z_scores(mean, error, expected.mean, expected.standard_error, expected.step_error)
     assert noise < 0.3
     assert np.abs(z).max() < 5
-    assert np.abs(mean - reference.mean).sum() < (1.5 * noise + 0.03) * total
+    assert np.abs(mean - expected.mean).sum() < (1.5 * noise + 0.03) * total
 
 
 def test_thin_glass_changes():
     """Before a light: what it reflects and lets through of a sky of one brightness always sums up to that."""
     glass = sheet("thing", np.array([0, 0, 0.5]), {"type": "thindielectric"})
     back = cases.quad([-3, -2, 3], [0, 5, 0], [6, 0, 0], "lamp", bsdf=cases.diffuse(0.0), emitter=cases.light(2, 2, 2))
-    assert_exact(stage({"thing": glass, "lamp": back}), "thing.bsdf.eta", 0.02, 512, direction=[1])
+    assert_exact("thin_glass", stage({"thing": glass, "lamp": back}), "thing.bsdf.eta", 0.02, 512, direction=[1])
 
 
 # ---------------------- Warnings and refusals ----------------------
@@ -850,14 +867,14 @@ def test_attributes_that_differ_on_the_sides_of_an_edge_are_a_seam():
 
 def test_a_seam_of_colours_moves():
     colours = [[0.9, 0.1, 0.1]] * 4 + [[0.1, 0.1, 0.9]] * 4
-    assert_exact(beside_plate(two_squares(colours, shift=0.13)), "thing.vertex_positions")
+    assert_exact("seam", beside_plate(two_squares(colours, shift=0.13)), "thing.vertex_positions")
 
 
 @pytest.mark.parametrize("options", [{}, {"face_normals": True}], ids=str)
 def test_flipped_normals_move(options):
     bsdf = cases.diffuse(0.5, 0.4, 0.3, two_sided=True)
     thing = {"type": "cube", "to_world": at([0.1, 0, 0.2], 0.6), "flip_normals": True, "bsdf": bsdf, **options}
-    assert_exact(beside_plate(thing), "thing.vertex_positions")
+    assert_exact("_".join(["flipped", *options]), beside_plate(thing), "thing.vertex_positions")
 
 
 @pytest.mark.parametrize(

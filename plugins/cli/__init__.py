@@ -9,7 +9,7 @@ import tyro
 
 from rimlight.loading import InputError
 
-from ._commands import COMMANDS
+from ._commands import commands
 
 __all__ = ["main"]
 
@@ -24,15 +24,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     Exit code: 0 success, 1 `check` found a disagreement, 2 bad input (one line on standard error says which),
     130 interrupted.
     """
+    argv = list(sys.argv[1:] if argv is None else argv)
     try:
         command = tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
+            commands(argv),
             prog="rimlight",
             description="Derivatives of rendered images, visibility included, by edge sampling in Mitsuba 3.",
             args=argv,
         )
     except SystemExit as stop:  # --help, or options that tyro refuses
         return stop.code if isinstance(stop.code, int) else 2
+    except InputError as error:
+        print(f"rimlight: error: {error}", file=sys.stderr)
+        return 2
     try:
         return command.run()
     except InputError as error:

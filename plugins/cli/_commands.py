@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -430,13 +430,32 @@ class Demo:
         return 0
 
 
-COMMANDS = {
-    "sys-info": SysInfo,
-    "params": Params,
-    "plan": PlanCommand,
-    "render": Render,
-    "gradient": Gradient,
-    "check": Check,
-    "finite-differences": FiniteDifferencesCommand,
-    "demo": Demo,
-}
+@dataclass(frozen=True)
+class _Fit:
+    """Fit pose, material, light or shape to pictures, as a TOML file says."""
+
+
+@dataclass(frozen=True)
+class _Reproduce:
+    """Run the fits of Li et al. 2018 (figures 1 and 6), with a report of each and a table of all."""
+
+
+def commands(argv: Sequence[str]) -> dict[str, type]:
+    """Commands by their names. argv : for one whose options depend on a file that they name."""
+    fit, reproduce = _Fit, _Reproduce
+    if argv[:1] in (["fit"], ["reproduce"]):
+        from . import _fit  # only now, since it imports much
+
+        fit, reproduce = _fit.command(argv), _fit.Reproduce
+    return {
+        "sys-info": SysInfo,
+        "params": Params,
+        "plan": PlanCommand,
+        "render": Render,
+        "gradient": Gradient,
+        "check": Check,
+        "finite-differences": FiniteDifferencesCommand,
+        "fit": fit,
+        "reproduce": reproduce,
+        "demo": Demo,
+    }

@@ -1,0 +1,220 @@
+"""The fits of Li et al. 2018, section 5, one after the other: `rimlight reproduce`.
+
+Each is a scene and a TOML file in `rimlight.scenes`. Results that are there already are not made again, so that an
+interrupted run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import matplotlib.lines
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from rimlight import scenes
+from rimlight.edge_sampling.exr import replacing
+from rimlight.scenes import room
+
+from . import problem as problems
+from . import report
+from .fitting import Fit, fit
+from .problem import Problem
+
+#: Experiments, each with its title.
+EXPERIMENTS = {
+    "fig1": "177 parameters of a room, seen by a fisheye camera",
+    "fig6a": "Vertices of two triangles, one partly hidden",
+    "fig6b": "Corners of a blocker, from its shadow alone",
+    "fig6c": "Camera and materials of a glossy table",
+    "fig6d": "Corners of a blocker, in a glossy floor",
+    "fig6e": "A square behind the camera, in an almost perfect mirror",
+    "fig6f": "Camera in a room with soft shadows and interreflections",
+}
+
+FIGURES = {"fig6": tuple(name for name in EXPERIMENTS if name.startswith("fig6")), "all": tuple(EXPERIMENTS)}
+
+#: A fit of figure 6 holds if all parameters are left with at most this part of their error at the start, or if the
+#: error of its picture is at most so many times its noise.
+LEFT, NOISE = 0.01, 1.5
+
+#: That of figure 1 holds if this part of the error of the camera is left, and the median error of the materials and
+#: lights is at most this part of their values.
+CAMERA, VALUES = 0.005, 0.05
+
+PEER = "prb_projective"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One fit of an experiment.
+
+    left : largest error of a parameter over that at the start; pose : of rigid bodies alone. values : median relative
+        error of materials and lights. picture, noise : root mean square errors of the first
+        view, at the result and at the truth. status : see `Fit`.
+    times, losses : of each step.
+    """
+
+    name: str
+    seed: int
+    method: str
+    left: float
+    pose: float
+    values: float
+    picture: float
+    noise: float
+    seconds: float
+    status: str
+    times: list[float]
+    losses: list[float]
+
+    @property
+    def holds(self) -> bool:
+        if self.name == "fig1":
+            return self.pose <= CAMERA and self.values <= VALUES
+        return self.left <= LEFT or self.picture <= NOISE * self.noise
+
+
+def problem_of(name: str, folder: Path | None = None) -> Problem:
+    """The fit of an experiment. folder : for scenes that a program makes."""
+    if name == "fig1":
+        return problems.read(room.write(folder or Path("room")))
+    return problems.read(scenes.path("two_triangles").parent / "fits" / f"{name}.toml")
+
+
+def reproduce(
+    figure: str, out: Path, *, seeds: Sequence[int] = range(5), peer: bool = False, progress: bool = True
+) -> list[Outcome]:
+    """Run the experiments of a figure, with a report for each fit, and a summary in `out`.
+
+    figure : "fig1", "fig6a", …, "fig6", or "all".
+    peer : fit with Mitsuba's `prb_projective`, too, for as long as our fit took.
+
+    Raises
+    ------
+    ValueError : there is no such figure. OSError : the folder cannot be written to.
+    """
+    names = FIGURES.get(figure, (figure,))
+    if not set(names) <= set(EXPERIMENTS):
+        raise ValueError(f'there is no experiment "{figure}", choose one of {", ".join([*EXPERIMENTS, *FIGURES])}')
+    out.mkdir(parents=True, exist_ok=True)
+    outcomes = []
+    for name in names:
+        for seed in seeds:
+            ours = _outcome(name, seed, "ours", out, None, progress)
+            outcomes.append(ours)
+            if peer:
+                outcomes.append(_outcome(name, seed, PEER, out, ours.seconds, progress))
+            write_summary(out, outcomes)
+    return outcomes
+
+
+def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None, progress: bool) -> Outcome:
+    folder = out / name / f"{method}_{seed}"
+    file = folder / "outcome.json"
+    if file.exists():
+        return Outcome(**json.loads(file.read_text("utf-8")))
+    problem = dataclasses.replace(problem_of(name, out / name), seed=seed)
+    if method == PEER:
+        depth = problem.integrator.get("max_depth", 2 if problem.integrator["type"] == "direct_edge" else -1)
+        problem = dataclasses.replace(problem, integrator={"type": PEER, "max_depth": depth}, seconds=seconds)
+    found = fit(problem, out=folder, resume=(folder / "checkpoint.npz").exists(), progress=progress)
+    if found.status == "interrupted":
+        raise KeyboardInterrupt
+    report.write(folder, found, title=f"{EXPERIMENTS[name]} ({name}, {method}, seed {seed})")
+    outcome = _judge(name, seed, method, found)
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(dataclasses.asdict(outcome)), "utf-8")
+    # Dr.Jit 1.5 aborts ("invalid redefinition of function") with the kernels of many scenes.
+    del found
+    gc.collect()
+    dr.flush_kernel_cache()
+    dr.flush_malloc_cache()
+    return outcome
+
+
+def _judge(name: str, seed: int, method: str, found: Fit) -> Outcome:
+    left = {label: float(e[-1] / e[0]) for label, e in found.errors.items() if e[0] > 0}
+    relative = [float(e[-1]) for label, e in found.errors.items() if label.endswith("relative error")]
+    _, picture = found.measures[0]["root mean square error"]
+    return Outcome(
+        name,
+        seed,
+        method,
+        max(left.values()),
+        max((x for label, x in left.items() if "relative error" not in label), default=0.0),
+        float(np.median(relative)) if relative else 0.0,
+        picture,
+        found.floors[0],
+        found.seconds,
+        found.status,
+        found.times.tolist(),
+        found.losses.tolist(),
+    )
+
+
+# ------------------------------------------------------------------ summary
+
+
+def write_summary(out: Path, outcomes: Sequence[Outcome]) -> None:
+    """`summary.json`, `summary.md`, and `convergence.png`: losses over time."""
+    with replacing(out / "summary.json") as temporary:
+        temporary.write_text(json.dumps([dataclasses.asdict(o) for o in outcomes]), "utf-8")
+    with replacing(out / "summary.md") as temporary:
+        temporary.write_text("\n".join(table(outcomes)) + "\n", "utf-8")
+    write_convergence(out / "convergence.png", outcomes)
+
+
+def table(outcomes: Sequence[Outcome]) -> list[str]:
+    """One row for each experiment and method, medians over the seeds: Markdown."""
+    lines = [
+        "| experiment | method | error left | of each seed | picture / noise | of each seed | pose left | values off "
+        "| seconds | holds |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, method in dict.fromkeys((o.name, o.method) for o in outcomes):
+        mine = [o for o in outcomes if (o.name, o.method) == (name, method)]
+        left, ratio = [o.left for o in mine], [o.picture / max(o.noise, 1e-12) for o in mine]
+        holds = sum(o.holds for o in mine)
+        lines.append(
+            f"| {name} | {method} | {np.median(left):.2%} | {', '.join(f'{x:.2%}' for x in left)} | "
+            f"{np.median(ratio):.2f} | {', '.join(f'{x:.2f}' for x in ratio)} | "
+            f"{np.median([o.pose for o in mine]):.2%} | {np.median([o.values for o in mine]):.2%} | "
+            f"{np.median([o.seconds for o in mine]):.0f} | {holds} of {len(mine)} |"
+        )
+    return lines
+
+
+def write_convergence(path: Path, outcomes: Sequence[Outcome]) -> None:
+    """Loss over time, one plot for each experiment, one curve for each fit: PNG."""
+    names = list(dict.fromkeys(o.name for o in outcomes))
+    columns = min(len(names), 3)
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(4 * columns, 3 * rows), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, name in zip(figure.subplots(rows, columns, squeeze=False).ravel(), names, strict=False):
+        for o in (o for o in outcomes if o.name == name):
+            colour = "C0" if o.method == "ours" else "C1"
+            axes.loglog(o.times, _smooth(o.losses), colour, linewidth=1, alpha=0.7)
+        axes.set(title=name, xlabel="seconds", ylabel="loss")
+        axes.grid(alpha=0.3)
+    methods = dict.fromkeys(o.method for o in outcomes)
+    lines = [matplotlib.lines.Line2D([], [], color="C0" if m == "ours" else "C1", label=m) for m in methods]
+    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines))
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _smooth(losses: Sequence[float]) -> np.ndarray:
+    """Mean of up to ten losses up to each."""
+    total = np.cumsum([0.0, *losses])
+    end = np.arange(1, len(losses) + 1)
+    begin = np.maximum(end - 10, 0)
+    return (total[end] - total[begin]) / (end - begin)

@@ -1,0 +1,133 @@
+"""`rimlight fit`: its options are those of a problem, whose defaults come from the TOML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from rimlight import inverse
+from rimlight.inverse import Free, Problem
+from rimlight.loading import InputError, expected
+
+from ._loading import at_least, check_output
+
+#: What is shown by --help before there is a file.
+EXAMPLE = Problem(scene=Path("scene.xml"), free=(Free(key=("shape.vertex_positions",), kind="pose"),))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """Fit pose, material, light or shape to pictures, as a TOML file says."""
+
+    kind: Positional[Literal["pose", "material", "light", "shape", "joint"]]
+    """Fit the free parameters of this kind, or all."""
+    config: Annotated[Positional[Path], arg(metavar="CONFIG.TOML")]
+    """The problem. Each of its entries is an option here, too."""
+    out: Path
+    """Folder for the report, the result and checkpoints."""
+    resume: bool = False
+    """Go on from the checkpoint in that folder."""
+    workers: int = 0
+    """Processes to share the work. 0: none but this one."""
+    cluster: str | None = None
+    """Address of the scheduler of a Dask cluster, or "local"."""
+    tensorboard: bool = False
+    """Write a log for TensorBoard into the folder."""
+    problem: Annotated[Problem, arg(name="")] = EXAMPLE
+
+    def run(self) -> int:
+        at_least(0, workers=self.workers)
+        check_output(self.out, folder=True)
+        if not self.resume and (self.out / "checkpoint.npz").exists():
+            raise InputError(f'--out: "{self.out}" holds a fit already; add --resume, or name another folder')
+        problem = self.problem
+        if self.kind != "joint":
+            free = tuple(f for f in problem.free if f.kind == self.kind)
+            if not free:
+                kinds = ", ".join(sorted({f.kind for f in problem.free}))
+                raise InputError(f'nothing of the kind "{self.kind}" is free in "{self.config}", only {kinds}')
+            problem = dataclasses.replace(problem, free=free)
+        logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
+        # ValueError and OSError: bad input. RuntimeError: what our integrators refuse.
+        with ExitStack() as stack, expected(ValueError, OSError), expected(RuntimeError, pattern=r"^[\w ]+: "):
+            executor = None
+            if self.cluster is not None:
+                executor = stack.enter_context(inverse.Cluster(problem, self.cluster))
+            elif self.workers:
+                executor = stack.enter_context(inverse.Processes(problem, self.workers))
+            found = inverse.fit(
+                problem, out=self.out, resume=self.resume, executor=executor, tensorboard=self.tensorboard
+            )
+            inverse.write(self.out, found, title=self.config.stem)
+        _print(found, self.out)
+        return {"finished": 0, "out of time": 0, "interrupted": 130}.get(found.status, 1)
+
+
+def _print(found: inverse.Fit, out: Path) -> None:
+    print(f"{found.status}: {len(found.losses)} steps in {found.seconds:.1f} s")
+    for label, errors in found.errors.items():
+        print(f"  {label}: {errors[0]:.4g} -> {errors[-1]:.4g}")
+    for i, measures in enumerate(found.measures):
+        for label, (before, after) in measures.items():
+            print(f"  view {i}, {label}: {before:.4g} -> {after:.4g}")
+        if found.floors:
+            print(f"  view {i}, root mean square error at the truth (noise): {found.floors[i]:.4g}")
+    if found.skipped:
+        print(f"  {found.skipped} steps were left out: their gradients were not finite")
+    for name in found.silent:
+        print(f'  "{name}" has no influence on the pictures')
+    print(f"report: {out / 'report.html'}")
+
+
+def command(argv: Sequence[str]) -> Any:
+    """`Fit`, with the problem of the TOML file that the arguments name as the default of its options."""
+    files = [a for a in argv if a.lower().endswith(".toml") and not a.startswith("-")]
+    if not files or {"-h", "--help"} & set(argv):
+        return Fit
+    with expected(ValueError, OSError):
+        if not os.path.exists(files[0]):
+            raise InputError(f'there is no file "{files[0]}"')
+        problem = inverse.read(files[0])
+    annotation = Annotated[Problem, arg(name="")]
+    made = dataclasses.make_dataclass(
+        "Fit",
+        [("problem", annotation, problem)],
+        bases=(Fit,),
+        frozen=True,
+        kw_only=True,
+        namespace={"__doc__": Fit.__doc__},
+    )
+    return made
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Run the fits of Li et al. 2018 (figures 1 and 6), with a report of each and a table of all."""
+
+    figure: Positional[Literal["fig1", "fig6a", "fig6b", "fig6c", "fig6d", "fig6e", "fig6f", "fig6", "all"]]
+    """Which."""
+    out: Path
+    """Folder for the reports. What is there already is not made again."""
+    seeds: int = 1
+    """How many seeds."""
+    peer: bool = False
+    """Fit with Mitsuba's prb_projective, too, for as long."""
+
+    def run(self) -> int:
+        from rimlight.inverse import reproduce
+
+        at_least(1, seeds=self.seeds)
+        check_output(self.out, folder=True)
+        logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
+        with expected(ValueError, OSError):
+            outcomes = reproduce.reproduce(self.figure, self.out, seeds=range(self.seeds), peer=self.peer)
+        print("\n".join(reproduce.table(outcomes)))
+        return 0

@@ -1,0 +1,394 @@
+"""Runs of fits: checkpoints and what becomes of them, other processes and machines, the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rimlight import inverse, scenes
+from rimlight.cli import main
+from rimlight.inverse import checkpoint, executors, fitting
+from rimlight.inverse import problem as problems
+from rimlight.inverse.problem import Free, Loss, Problem, Stage, Starts, Target
+from rimlight.inverse.renderer import Renderer, Task
+
+GREEN, RED, COLOUR = "green.vertex_positions", "red.vertex_positions", "green.bsdf.reflectance.value"
+SHAPE = Free(key=(GREEN,), kind="shape", move="xy", rate=0.05, start=(0.2, -0.1, 0))
+MATERIAL = Free(key=(COLOUR,), kind="material", rate=0.02, start=(0.2,))
+
+
+def triangles(*free: Free, steps: int = 6, **options) -> Problem:
+    options = {"stage": (Stage(iterations=steps),), "integrator": {"type": "direct_edge"}} | options
+    options = {"target": (Target(spp=64),), "define": {"res": "16"}} | options
+    return Problem(scene=scenes.path("two_triangles"), free=free or (SHAPE,), **options)
+
+
+def fit(problem: Problem, **options) -> fitting.Fit:
+    return inverse.fit(problem, progress=False, **options)
+
+
+def stopping_after(steps: int):
+    """An executor in the middle of whose work somebody presses Ctrl-C."""
+    calls = []
+
+    def executor(values, tasks):
+        calls.append(1)
+        if len(calls) == steps:
+            os.kill(os.getpid(), signal.SIGINT)
+        return [executor.renderer.gradient(values, task) for task in tasks]
+
+    executor.renderer = Renderer(triangles())
+    for view in executor.renderer.views:
+        view.picture()
+    return executor
+
+
+# ------------------------------------------------------------------ checkpoints
+
+#: Without a number: fits to the end, and resumes the others. Else it kills itself in the step of this number, between
+#: checkpoints ("between") or while it writes one ("writing").
+SCRIPT = """
+import os, signal, sys
+from rimlight import inverse
+import drjit as dr
+import numpy as np
+from rimlight.edge_sampling import exr
+from rimlight.inverse import checkpoint, fitting, problem
+
+dr.set_thread_count(1)
+fitting.INTERVAL = 0
+
+def fit(folder, resume=False, last=None, when=None):
+    run = fitting.Run(problem.read("fit.toml"), out=folder, resume=resume)
+    steps = [run.progress.step]
+
+    def executor(values, tasks):
+        steps.append(run.progress.step)
+        if run.progress.step == last:
+            if when == "between":
+                os.kill(os.getpid(), signal.SIGKILL)
+            exr.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+        if when == "between" and run.progress.step == last - 3:
+            fitting.INTERVAL = 1000
+        return [run.renderer.gradient(values, task) for task in tasks]
+
+    run.executor = executor
+    found = run.finish(progress=False)
+    errors = {label.replace("/", " "): e for label, e in found.errors.items()}
+    frames = np.array([step for step, _ in found.frames])
+    np.savez(folder + ".npz", losses=found.losses, segments=found.segments, frames=frames, began=steps[0],
+             **found.values, **errors)
+
+if len(sys.argv) > 1:
+    fit(sys.argv[1], last=int(sys.argv[2]), when=sys.argv[3])
+else:
+    fit("whole")
+    for folder in sorted(name for name in os.listdir() if name.startswith("killed")):
+        fit(folder, resume=True)
+"""
+
+
+@pytest.mark.slow
+def test_killed_fits_resume_bit_by_bit(tmp_path):
+    """Among several starts, in a later stage, and while a checkpoint is written."""
+    pose = Free(key=(RED,), kind="pose", move="xy", turn="z", start=(0.1, 0, 0, 0, 0, 20), rate=0.05)
+    posed = triangles(
+        *(SHAPE, MATERIAL, pose),
+        stage=(Stage(iterations=10, resolution=12), Stage(iterations=20, rate=0.5, decay=0.1)),
+        starts=Starts(count=3, move=0.1, turn=10, value=0.1),
+        clip=2.0,
+        parts=2,
+    )
+    problems.write(tmp_path / "fit.toml", posed)
+    (tmp_path / "run.py").write_text(SCRIPT)
+    script = [sys.executable, "-W", "error", "run.py"]
+    deaths = {"killed-exploring": (17, "between"), "killed-later": (43, "between"), "killed-writing": (37, "writing")}
+    for folder, (step, when) in deaths.items():
+        command = [*script, folder, str(step), when]
+        process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+        assert process.returncode == -signal.SIGKILL, process.stderr
+        _, facts = checkpoint.load(tmp_path / folder / "checkpoint.npz")
+        assert facts["step"] == (step if when == "writing" else step - 3)
+    process = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+    assert process.returncode == 0, process.stderr
+    with np.load(tmp_path / "whole.npz") as file:
+        whole = dict(file)
+    assert len(whole["losses"]) == 50 and whole["losses"][-1] < whole["losses"][0]
+    for folder, (step, when) in deaths.items():
+        with np.load(tmp_path / f"{folder}.npz") as resumed:
+            assert resumed["began"] == (step if when == "writing" else step - 3)
+            for name in whole.keys() - {"began"}:
+                np.testing.assert_array_equal(resumed[name], whole[name], err_msg=f"{folder}, {name}")
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory) -> Path:
+    """Folder of a fit that was interrupted after 4 steps of 6."""
+    folder = tmp_path_factory.mktemp("stopped") / "fit"
+    found = fit(triangles(), out=folder, executor=stopping_after(4))
+    assert found.status == "interrupted" and len(found.losses) == 4
+    return folder
+
+
+def test_interrupted_fits_resume(stopped, tmp_path):
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    (folder / "checkpoint.npz").write_bytes((stopped / "checkpoint.npz").read_bytes())
+    whole = fit(triangles())
+    resumed = fit(dataclasses.replace(triangles(), seconds=1000.0), out=folder, resume=True)
+    assert resumed.status == "finished"
+    np.testing.assert_allclose(resumed.losses, whole.losses, rtol=1e-4)
+    np.testing.assert_allclose(resumed.values[GREEN], whole.values[GREEN], atol=1e-4)
+    again = fit(triangles(), out=folder, resume=True)  # there is nothing left to do
+    np.testing.assert_array_equal(again.losses, resumed.losses)
+    np.testing.assert_array_equal(again.values[GREEN], resumed.values[GREEN])
+    assert again.seconds == pytest.approx(resumed.seconds)
+
+
+def test_checkpoints_hold_numbers_and_text_only(stopped):
+    file = stopped / "checkpoint.npz"
+    with zipfile.ZipFile(file) as archive:
+        assert all(name.endswith(".npy") for name in archive.namelist())
+    with np.load(file, allow_pickle=False) as arrays:
+        kinds = {arrays[name].dtype.kind for name in arrays.files}
+    assert kinds <= set("fiuU")
+    assert sorted(path.name for path in stopped.iterdir()) == ["checkpoint.npz", "problem.toml"]
+    assert problems.read(stopped / "problem.toml") == triangles()
+
+
+@pytest.mark.parametrize(
+    ("change", "culprits"),
+    [
+        ({"seed": 1}, ["seed"]),
+        ({"loss": Loss(norm="l1"), "parts": 2}, ["loss, parts"]),
+        ({"stage": (Stage(iterations=7),)}, ["stage"]),
+        ({"free": (dataclasses.replace(SHAPE, rate=0.1),)}, ["free"]),
+        ({"define": {"res": "15"}}, ["define"]),
+    ],
+)
+def test_checkpoints_of_other_fits_are_refused(stopped, change, culprits):
+    with pytest.raises(ValueError) as error:
+        fit(dataclasses.replace(triangles(), **change), out=stopped, resume=True)
+    message = str(error.value)
+    assert "\n" not in message and f"another {culprits[0]};" in message and "checkpoint.npz" in message
+
+
+def damaged(whole: bytes) -> dict[str, bytes]:
+    middle = len(whole) // 2
+    flipped = whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :]
+    return {"empty": b"", "half": whole[:middle], "flipped": flipped, "text": b"no checkpoint", "short": whole[:-3]}
+
+
+@pytest.mark.parametrize("kind", ["empty", "half", "flipped", "text", "short", "other", "newer"])
+def test_damaged_checkpoints_are_refused(stopped, tmp_path, kind):
+    file = tmp_path / "checkpoint.npz"
+    if kind == "other":
+        np.savez(file, a=np.zeros(3))
+    elif kind == "newer":
+        np.savez(file, facts=np.array(json.dumps({"version": checkpoint.VERSION + 1})))
+    else:
+        file.write_bytes(damaged((stopped / "checkpoint.npz").read_bytes())[kind])
+    before = file.read_bytes()
+    with pytest.raises(ValueError) as error:
+        fit(triangles(), out=tmp_path, resume=True)
+    assert "\n" not in str(error.value) and "checkpoint.npz" in str(error.value)
+    assert file.read_bytes() == before
+
+
+def test_there_must_be_a_checkpoint(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint.*checkpoint\.npz"):
+        fit(triangles(), out=tmp_path, resume=True)
+    with pytest.raises(ValueError, match="name the folder"):
+        fit(triangles(), resume=True)
+
+
+def test_a_full_disk_is_said_once(tmp_path, monkeypatch, caplog):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(fitting, "INTERVAL", 0)
+    run = fitting.Run(triangles(), out=tmp_path)
+    first = (tmp_path / "checkpoint.npz").read_bytes()
+    monkeypatch.setattr(checkpoint, "save", full)
+    with caplog.at_level(logging.WARNING, logger=fitting.__name__):
+        found = run.finish(progress=False)
+    assert found.status == "finished" and len(found.losses) == 6 and len(found.views) == 1
+    (record,) = caplog.records
+    assert "No space left on device" in record.getMessage()
+    assert (tmp_path / "checkpoint.npz").read_bytes() == first
+
+
+# ------------------------------------------------------------------ other processes
+
+
+def shared() -> Problem:
+    """Two views, in two parts each."""
+    targets = Target(spp=64), Target(scene=scenes.path("two_triangles"), spp=32)
+    return triangles(SHAPE, MATERIAL, steps=4, target=targets, parts=2)
+
+
+@pytest.fixture(scope="module")
+def alone() -> fitting.Fit:
+    return fit(shared())
+
+
+def assert_same(found: fitting.Fit, alone: fitting.Fit) -> None:
+    assert found.status == "finished"
+    np.testing.assert_allclose(found.losses, alone.losses, rtol=1e-6 / alone.losses.max())
+    for key, value in alone.values.items():
+        np.testing.assert_allclose(found.values[key], value, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2])
+def test_processes_find_the_same(alone, caplog, count):
+    """Also when one of them is killed at its work."""
+    posed = shared()
+    with inverse.Processes(posed, count) as workers:
+        assert_same(fit(posed, executor=workers), alone)
+        if count == 2:
+            first = workers.pool
+            values = {GREEN: alone.values[GREEN], COLOUR: alone.values[COLOUR]}
+            tasks = [Task(i % 2, 256, 64, i) for i in range(6)]
+            timer = threading.Timer(0.1, os.kill, (next(iter(first._processes)), signal.SIGKILL))
+            timer.start()
+            with caplog.at_level(logging.WARNING, logger=executors.__name__):
+                found = workers(values, tasks)
+            timer.join()
+            assert workers.pool is not first and "a worker died (1 of 4 tries)" in caplog.text
+            assert len({gradient.loss for gradient in found}) == 6
+            here = Renderer(posed)
+            for view in here.views:
+                view.picture()
+            expected = here.gradient(values, tasks[5])
+            assert found[5].loss == pytest.approx(expected.loss, rel=1e-5)
+            assert_same(fit(posed, executor=workers), alone)
+    assert not workers.pool._processes
+
+
+def test_workers_that_always_die_end_the_fit(caplog):
+    """Those of a problem that cannot be read by them do not: its error comes back."""
+    with pytest.raises(ValueError, match="workers must be >= 1, got 0"):
+        inverse.Processes(shared(), 0)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default::ResourceWarning", "default::DeprecationWarning")
+def test_a_cluster_finds_the_same(alone):
+    pytest.importorskip("distributed")
+    posed = shared()
+    with inverse.Cluster(posed, "local") as workers:
+        assert_same(fit(posed, executor=workers), alone)
+
+
+def test_there_must_be_a_cluster():
+    pytest.importorskip("distributed")
+    with pytest.raises(ValueError, match='no cluster at "nonsense://1"') as error:
+        inverse.Cluster(shared(), "nonsense://1")
+    assert "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------ command line
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    path = tmp_path / "joint.toml"
+    problems.write(path, triangles(SHAPE, MATERIAL))
+    return path
+
+
+def steps_of(folder: Path) -> int:
+    return json.loads((folder / "result.json").read_text())["steps"]
+
+
+def test_command(file, tmp_path, capfd):
+    out = tmp_path / "deep" / "out"
+    assert main(["fit", "joint", str(file), "--out", str(out)]) == 0
+    said = capfd.readouterr().out
+    assert "finished: 6 steps" in said and str(out / "report.html") in said and "green: farthest vertex" in said
+    names = {path.name for path in out.iterdir()}
+    assert names >= {"report.html", "result.json", "result.npz", "problem.toml", "checkpoint.npz", "result_0.exr"}
+    assert steps_of(out) == 6
+    assert "joint" in (out / "report.html").read_text("utf-8")
+    with np.load(out / "result.npz") as found:
+        assert found.keys() == {GREEN, COLOUR}
+        first = dict(found)
+    assert problems.read(out / "problem.toml") == problems.read(file)
+
+    assert main(["fit", "joint", str(file), "--out", str(out)]) == 2  # not over a fit that is there
+    (line,) = capfd.readouterr().err.splitlines()
+    assert "holds a fit already" in line and "--resume" in line
+    assert main(["fit", "joint", str(file), "--out", str(out), "--resume"]) == 0
+    with np.load(out / "result.npz") as found:
+        np.testing.assert_array_equal(found[GREEN], first[GREEN])
+    assert main(["fit", "joint", str(file), "--out", str(out), "--resume", "--seed", "3"]) == 2
+    assert "another seed" in capfd.readouterr().err
+
+
+def test_kinds_and_options_of_the_command(file, tmp_path, capfd):
+    out = tmp_path / "out"
+    options = ["--stage.0.iterations", "3", "--loss.norm", "l1", "--seed", "5"]
+    assert main(["fit", "material", str(file), "--out", str(out), *options]) == 0
+    written = problems.read(out / "problem.toml")
+    assert written.free == (MATERIAL,) and written.seed == 5 and written.loss.norm == "l1"
+    assert written.stage == (Stage(iterations=3),) and steps_of(out) == 3
+    with np.load(out / "result.npz") as found:
+        assert found.keys() == {COLOUR}
+
+
+def test_exit_codes_of_fits_that_stop(file, tmp_path, capfd, monkeypatch):
+    gradient = Renderer.gradient
+    broken = lambda *a: dataclasses.replace(gradient(*a), loss=float("nan"))
+
+    def pressed(*a):
+        os.kill(os.getpid(), signal.SIGINT)
+        return gradient(*a)
+
+    for name, function, code, status in (("a", broken, 1, "gave up"), ("b", pressed, 130, "interrupted")):
+        out = tmp_path / name
+        monkeypatch.setattr(Renderer, "gradient", function)
+        assert main(["fit", "joint", str(file), "--out", str(out), "--max-bad", "2"]) == code
+        assert status in capfd.readouterr().out
+        assert status in (out / "report.html").read_text("utf-8")
+        assert json.loads((out / "result.json").read_text())["status"].startswith(status)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "culprits"),
+    [
+        (["joint", "gone.toml", "--out", "o"], ["gone.toml"]),
+        (["joint", "bad.toml", "--out", "o"], ["bad.toml", "sead"]),
+        (["pose", "joint.toml", "--out", "o"], ['"pose"', "material, shape"]),
+        (["joint", "joint.toml", "--out", "bad.toml"], ["bad.toml", "not a folder"]),
+        (["joint", "joint.toml", "--out", "bad.toml/o"], ["bad.toml", "not a folder"]),
+        (["joint", "joint.toml", "--out", "o", "--workers", "-1"], ["--workers", "-1"]),
+        (["joint", "joint.toml", "--out", "o", "--parts", "0"], ["parts must be >= 1, got 0"]),
+        (["joint", "joint.toml", "--out", "o", "--integrator.type", "direct_egde"], ["direct_egde"]),
+        (["joint", "joint.toml", "--out", "o", "--resume"], ["checkpoint.npz"]),
+        (["joint", "joint.toml", "--out", "o", "--cluster", "nonsense://1"], ["nonsense://1"]),
+        (["joint", "unknown.toml", "--out", "o"], ["gren.vertex_positions", "did you mean green"]),
+    ],
+)
+def test_mistakes_end_in_one_line(file, tmp_path, capfd, monkeypatch, arguments, culprits):
+    monkeypatch.chdir(tmp_path)
+    Path("bad.toml").write_text("sead = 3\n" + file.read_text())
+    Path("unknown.toml").write_text(file.read_text().replace(GREEN, "gren.vertex_positions"))
+    assert main(["fit", *arguments]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("rimlight: error: ")
+    for culprit in culprits:
+        assert culprit in line
+    assert not Path("o", "report.html").exists()
