@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
 #: Steps over which the loss is averaged before it is compared.
 WINDOW = 10
 
+#: Standard errors by which the best loss must be better than the last one for the fit to go back to it.
+SURE = 4.0
+
 #: A stage goes on while its loss falls by this fraction within `patience` steps.
 FALL = 1e-3
 
@@ -64,7 +67,8 @@ class Progress:
     frames : (step, latents) for an animation.
     skipped : gradients that were not finite; bad : of them, without a finite one since.
     touched : latents whose gradient was ever not zero.
-    best_loss, best : mean of the loss over `WINDOW` steps of the present segment, and the latents then.
+    best_loss, best_error, best : smallest mean of the loss over `WINDOW` steps of the present segment, its standard
+        error, and the latents then.
     fell : last iteration of the segment at which the loss had fallen.
     found : of starts that have been tried: mean loss at their end, and latents.
     seconds : in the loop, of all runs.
@@ -82,6 +86,7 @@ class Progress:
     bad: int = 0
     touched: set[str] = field(default_factory=set)
     best_loss: float = float("inf")
+    best_error: float = 0.0
     best: dict[str, np.ndarray] = field(default_factory=dict)
     fell: int = 0
     found: list[tuple[float, dict[str, np.ndarray]]] = field(default_factory=list)
@@ -183,7 +188,7 @@ class Run:
             view.picture()
         self.parameters = free_parameters.find(problem.free, self.renderer.params)
         self.truth_is_known = all(target.file is None for target in problem.target)
-        self.optimisers = [Optimiser(parameter, problem) for parameter in self.parameters]
+        self.optimiser = Optimiser(self.parameters, problem)
         self.executor: Executor = executor or (lambda values, tasks: [self.renderer.gradient(values, t) for t in tasks])
         self.start = self._latents()
         starts = problem.starts.count
@@ -196,8 +201,6 @@ class Run:
         self._disk_failed = False
         if resume:
             self._restore()
-            if executor is None:
-                self._prime()
         else:
             self._begin()
             if self.file is not None:
@@ -241,7 +244,7 @@ class Run:
         """One step of the plan."""
         now, segment = self.progress, self.plan[self.progress.segment]
         stage = segment.stage
-        attached = [optimiser.values() for optimiser in self.optimisers]
+        attached = self.optimiser.values()
         values = {key: to_numpy(value) for of_one in attached for key, value in of_one.items()}
         tasks = [
             Task(i, stage.resolution, stage.spp, derived_seed(self.problem.seed, now.step, i, part))
@@ -258,10 +261,10 @@ class Run:
         if np.isfinite(loss) and all(np.isfinite(g).all() for g in gradients.values()):
             now.bad = 0
             done = now.iteration / max(stage.iterations - 1, 1)
-            for optimiser, of_one in zip(self.optimisers, attached, strict=True):
+            for parameter, of_one in zip(self.parameters, attached, strict=True):
                 if any(np.any(gradients[key]) for key in of_one):
-                    now.touched.add(optimiser.parameter.name)
-                optimiser.step(of_one, gradients, stage.rate * stage.decay**done)
+                    now.touched.add(parameter.name)
+            self.optimiser.step(attached, gradients, stage.rate * stage.decay**done)
         else:
             now.skipped += 1
             now.bad += 1
@@ -292,11 +295,11 @@ class Run:
         now.losses.append(loss)
         now.segments.append(now.segment)
         if now.iteration + 1 >= WINDOW:
-            mean = float(np.mean(now.losses[-WINDOW:]))
+            mean, error = self._recent()
             if mean < now.best_loss * (1 - FALL):
                 now.fell = now.iteration
             if mean < now.best_loss:
-                now.best_loss, now.best = mean, latents
+                now.best_loss, now.best_error, now.best = mean, error, latents
 
     def _note_errors(self, latents: dict[str, np.ndarray]) -> None:
         if self.truth_is_known:
@@ -316,8 +319,8 @@ class Run:
             now.found.append((loss if np.isfinite(loss) else float("inf"), self._latents()))
             if last:
                 self._restart_at_best_start()
-        elif last and now.best:
-            self._restart(now.best)
+        elif last:
+            self._restore_best()
         now.segment += 1
         now.iteration = 0
         if not last:
@@ -333,6 +336,22 @@ class Run:
             self._restart_at_best_start()
             now.found = []
 
+    def _restore_best(self) -> None:
+        """Go back to the best state of the segment, if the noise of the loss does not explain that it was better."""
+        now = self.progress
+        if now.best:
+            mean, error = self._recent()
+            if not mean <= now.best_loss + SURE * np.hypot(error, now.best_error):
+                self._restart(now.best)
+
+    def _recent(self) -> tuple[float, float]:
+        """Mean of the last losses that are finite, and its standard error."""
+        recent = np.array(self.progress.losses[-WINDOW:])
+        recent = recent[np.isfinite(recent)]
+        if len(recent) < 2:
+            return float("inf"), 0.0
+        return float(recent.mean()), float(recent.std(ddof=1) / np.sqrt(len(recent)))
+
     def _restart_at_best_start(self) -> None:
         self._restart(min(self.progress.found, key=lambda entry: entry[0])[1])
 
@@ -345,11 +364,10 @@ class Run:
         return {name: latent for of_one in scattered for name, latent in of_one.items()}
 
     def _restart(self, latents: Mapping[str, np.ndarray]) -> None:
-        for optimiser in self.optimisers:
-            optimiser.restart(latents)
+        self.optimiser.restart(latents)
 
     def _latents(self) -> dict[str, np.ndarray]:
-        return {name: latent for optimiser in self.optimisers for name, latent in optimiser.latents().items()}
+        return dict(self.optimiser.latents())
 
     def _shown(self) -> dict[str, str]:
         now = self.progress
@@ -382,7 +400,7 @@ class Run:
         if self.file is None:
             return
         now = self.progress
-        arrays = {f"optimiser/{name}": a for o in self.optimisers for name, a in o.state().items()}
+        arrays = {f"optimiser/{name}": a for name, a in self.optimiser.state().items()}
         arrays |= {f"best/{name}": a for name, a in now.best.items()}
         arrays |= {f"frame/{i}/{name}": a for i, (_, of_one) in enumerate(now.frames) for name, a in of_one.items()}
         arrays |= {f"found/{i}/{name}": a for i, (_, of_one) in enumerate(now.found) for name, a in of_one.items()}
@@ -420,22 +438,16 @@ class Run:
         found = [(loss, part(f"found/{i}/")) for i, loss in enumerate(facts.pop("found"))]
         touched = set(facts.pop("touched"))
         self.progress = Progress(**facts, frames=frames, found=found, touched=touched, best=part("best/"))
-        for optimiser in self.optimisers:
-            optimiser.restore(part("optimiser/"))
-
-    def _prime(self) -> None:
-        """Our integrators arrange the edges in a tree when they first see them, on which their random samples depend:
-        let that be where the fit began, as it was without interruption."""
-        stage, values = self.problem.stage[0], self._values(self.start)
-        for i in range(len(self.problem.target)):
-            self.renderer.gradient(values, Task(i, stage.resolution, stage.spp, 0))
+        self.optimiser.restore(part("optimiser/"))
 
     # ---------------------- Result ----------------------
 
     def _result(self, status: str) -> Fit:
         now = self.progress
-        if status != "finished" and (seen := [*now.found, *([(now.best_loss, now.best)] if now.best else [])]):
-            self._restart(min(seen, key=lambda entry: entry[0])[1])
+        if status != "finished":
+            self._restore_best()
+            if now.found and min(loss for loss, _ in now.found) < self._recent()[0]:
+                self._restart_at_best_start()
         latents = self._latents()
         self._note_errors(latents)
         values = self._values(latents)

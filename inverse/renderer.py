@@ -6,7 +6,9 @@ weighs a second, independent render, backward. Both are recorded once and replay
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import gc
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +19,7 @@ import numpy as np
 from rimlight.loading import load_integrator, load_scene, use_variant
 
 from . import losses, targets
-from .free_parameters import from_flat
+from .free_parameters import from_flat, to_numpy
 from .problem import Problem
 
 #: Sensors whose renders Dr.Jit cannot replay with Mitsuba 3.9.
@@ -67,12 +69,14 @@ class Renderer:
         use_variant(problem.variant)
         self.problem = problem
         options = dict(problem.integrator)
-        self.integrator = load_integrator(options.pop("type"), **options)
+        kind = options.pop("type")
         define = [f"{key}={value}" for key, value in problem.define.items()]
         paths = [target.scene or problem.scene for target in problem.target]
         # Every load of a scene costs memory that never comes back.
         scenes = {path: load_scene(path, define) for path in dict.fromkeys(paths)}
-        self.views = [View(self, i, scenes[path]) for i, path in enumerate(paths)]
+        # One for each: ours remember the edges of the last scene.
+        integrators = {path: load_integrator(kind, **options) for path in scenes}
+        self.views = [View(self, i, scenes[path], integrators[path]) for i, path in enumerate(paths)]
         self.params = {}
         for scene in scenes.values():
             self.params = dict(mi.traverse(scene).items()) | self.params
@@ -98,17 +102,20 @@ class Renderer:
             )
         loss, by_pixel = losses.value_and_gradient(self.problem.loss, image, target, weight)
         view.backward(by_pixel, derived_seed(task.seed), task.spp)
-        gradients = {key: np.array(dr.grad(leaf), np.float32) for key, leaf in leaves.items()}
+        found = {key: dr.grad(leaf) for key, leaf in leaves.items()}
+        dr.eval(found)
+        gradients = {key: np.array(gradient, np.float32) for key, gradient in found.items()}
         return Gradient(loss, gradients, image)
 
 
 class View:
     """One target, and the sensor that takes the same picture."""
 
-    def __init__(self, renderer: Renderer, number: int, scene: mi.Scene):
-        self.renderer, self.number, self.scene = renderer, number, scene
+    def __init__(self, renderer: Renderer, number: int, scene: mi.Scene, integrator: mi.Integrator):
+        self.renderer, self.number, self.scene, self.integrator = renderer, number, scene, integrator
         self.target = renderer.problem.target[number]
         self.params = mi.traverse(scene)
+        self.initial = dict(self.params.items())
         if self.target.sensor >= len(scene.sensors()):
             raise ValueError(
                 f"fit: target.{number}.sensor: the scene has {len(scene.sensors())} sensors, there is no number "
@@ -119,6 +126,7 @@ class View:
         #: The last channel of the film, which is not compared.
         self.alpha = mi.has_flag(self.sensor.film().flags(), mi.FilmFlags.Alpha)
         self.size = tuple(int(n) for n in reversed(self.sensor.film().crop_size()))
+        self.arranged: set[str] = set()
         self.functions: dict[Any, tuple[Callable, Callable]] = {}
         self.kinds = {}
         self._picture: tuple[np.ndarray, np.ndarray] | None = None
@@ -158,6 +166,16 @@ class View:
         for view in self.renderer.views:
             view.picture()  # while the scenes still are as their files have them
         self._resize(width)
+        here = {key for key in values if key in self.params}
+        if not here <= self.arranged:
+            # Our integrators arrange the edges when they first see them, and their random samples depend on that: let
+            # it be the same for all who compute, whenever they begin.
+            self._assign({key: to_numpy(self.initial[key]) for key in here})
+            self._find_boundaries()
+            self.arranged |= here
+        return self._assign(values)
+
+    def _assign(self, values: Mapping[str, np.ndarray]) -> dict[str, mi.Float]:
         leaves = {}
         for key, value in values.items():
             if key not in self.params:
@@ -184,7 +202,8 @@ class View:
 
     def render(self, seed: int, spp: int) -> np.ndarray:
         image, _ = self._functions(spp)
-        return self._colours(np.array(image(self.scene, self.renderer.integrator, dr.opaque(mi.UInt32, seed))))
+        with _no_collection():
+            return self._colours(np.array(image(self.scene, self.integrator, dr.opaque(mi.UInt32, seed))))
 
     def _colours(self, image: np.ndarray) -> np.ndarray:
         return (image[..., :-1] if self.alpha else image).astype(np.float32)
@@ -195,11 +214,12 @@ class View:
             by_pixel = np.concatenate([by_pixel, np.zeros_like(by_pixel[..., :1])], axis=2)
         weight = mi.TensorXf(by_pixel.astype(np.float32)) * dr.opaque(mi.Float, 1)
         dr.eval(weight)
-        derivative(self.scene, self.renderer.integrator, weight, dr.opaque(mi.UInt32, seed))
+        with _no_collection():
+            derivative(self.scene, self.integrator, weight, dr.opaque(mi.UInt32, seed))
 
     def _image(self, seed: Any, spp: int) -> mi.TensorXf:
         with dr.suspend_grad():
-            return self.renderer.integrator.render(self.scene, sensor=self.sensor, seed=seed, spp=spp)
+            return self.integrator.render(self.scene, sensor=self.sensor, seed=seed, spp=spp)
 
     def _functions(self, spp: int) -> tuple[Callable, Callable]:
         """Image and derivative. Recorded apart for each size of the film, which Dr.Jit does not look at."""
@@ -215,17 +235,32 @@ class View:
                 integrator.render_backward(scene, mi.traverse(scene), weight, sensor=sensor, seed=seed, spp=spp)
 
             if self._replays():
-                nothing = lambda scene, sensor: None
-                known = lambda scene, integrator, *_: getattr(integrator, "find_boundaries", nothing)(scene, sensor)
+                known = lambda *_: self._find_boundaries()
                 self.functions[key] = dr.freeze(image), dr.freeze(derivative, state_fn=known)
             else:
                 self.functions[key] = image, derivative
         return self.functions[key]
 
+    def _find_boundaries(self) -> Any:
+        find = getattr(self.integrator, "find_boundaries", None)
+        return None if find is None else find(self.scene, self.sensor)
+
     def _replays(self) -> bool:
-        renderer = self.renderer
-        possible = hasattr(renderer.integrator, "find_boundaries") or renderer.problem.integrator["type"] in REPLAYED
-        return renderer.problem.freeze and possible and self.sensor.class_name() not in NOT_REPLAYED
+        problem = self.renderer.problem
+        possible = hasattr(self.integrator, "find_boundaries") or problem.integrator["type"] in REPLAYED
+        return problem.freeze and possible and self.sensor.class_name() not in NOT_REPLAYED
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Dr.Jit ends the process if Python's garbage collector frees a scene while a function is recorded."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def derived_seed(*numbers: int) -> int:

@@ -94,11 +94,11 @@ def points(params, key: str = BOX) -> np.ndarray:
 
 def walk(parameter, steps: int = 8, slope: float | None = None, **options) -> dict[str, np.ndarray]:
     """Latents after steps down a slope, or along random gradients."""
-    optimiser = Optimiser(parameter, Problem(scene=Path("a.xml"), free=(parameter.free,), **options))
+    optimiser = Optimiser([parameter], Problem(scene=Path("a.xml"), free=(parameter.free,), **options))
     rng = np.random.default_rng(0)
     for _ in range(steps):
         attached = optimiser.values()
-        sizes = {key: free_parameters.to_numpy(value).size for key, value in attached.items()}
+        sizes = {key: free_parameters.to_numpy(value).size for key, value in attached[0].items()}
         along = lambda size: rng.standard_normal(size) if slope is None else np.full(size, slope)
         optimiser.step(attached, {key: along(size).astype(np.float32) for key, size in sizes.items()}, 1)
     return optimiser.latents()
@@ -229,7 +229,7 @@ def test_large_steps(params, smoothing):
     )
     assert set(torus.errors(torus.truth).values()) == {0}
     # One vertex is pulled; its neighbours come along.
-    optimiser = Optimiser(torus, Problem(scene=Path("a.xml"), free=(torus.free,)))
+    optimiser = Optimiser([torus], Problem(scene=Path("a.xml"), free=(torus.free,)))
     attached, pull = optimiser.values(), np.zeros(points(params, key).size, np.float32)
     pull[0] = -1
     optimiser.step(attached, {key: pull}, 1)

@@ -50,15 +50,14 @@ def stopping_after(steps: int):
         return [executor.renderer.gradient(values, task) for task in tasks]
 
     executor.renderer = Renderer(triangles())
-    for view in executor.renderer.views:
-        view.picture()
     return executor
 
 
 # ------------------------------------------------------------------ checkpoints
 
-#: Without a number: fits to the end, and resumes the others. Else it kills itself in the step of this number, between
-#: checkpoints ("between") or while it writes one ("writing").
+#: Arguments: folder, and what happens: "nothing", it resumes ("resume"), or it kills itself in the step of a number,
+#: between checkpoints ("between") or while it writes one ("writing"). Each in a process of its own: a second scene in
+#: the same process adds up in another order.
 SCRIPT = """
 import os, signal, sys
 from rimlight import inverse
@@ -70,7 +69,7 @@ from rimlight.inverse import checkpoint, fitting, problem
 dr.set_thread_count(1)
 fitting.INTERVAL = 0
 
-def fit(folder, resume=False, last=None, when=None):
+def fit(folder, resume, last, when):
     run = fitting.Run(problem.read("fit.toml"), out=folder, resume=resume)
     steps = [run.progress.step]
 
@@ -79,7 +78,8 @@ def fit(folder, resume=False, last=None, when=None):
         if run.progress.step == last:
             if when == "between":
                 os.kill(os.getpid(), signal.SIGKILL)
-            exr.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+            if when == "writing":
+                exr.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
         if when == "between" and run.progress.step == last - 3:
             fitting.INTERVAL = 1000
         return [run.renderer.gradient(values, task) for task in tasks]
@@ -91,12 +91,8 @@ def fit(folder, resume=False, last=None, when=None):
     np.savez(folder + ".npz", losses=found.losses, segments=found.segments, frames=frames, began=steps[0],
              **found.values, **errors)
 
-if len(sys.argv) > 1:
-    fit(sys.argv[1], last=int(sys.argv[2]), when=sys.argv[3])
-else:
-    fit("whole")
-    for folder in sorted(name for name in os.listdir() if name.startswith("killed")):
-        fit(folder, resume=True)
+folder, what, step = sys.argv[1:]
+fit(folder, resume=what == "resume", last=int(step), when=what)
 """
 
 
@@ -113,22 +109,27 @@ def test_killed_fits_resume_bit_by_bit(tmp_path):
     )
     problems.write(tmp_path / "fit.toml", posed)
     (tmp_path / "run.py").write_text(SCRIPT)
-    script = [sys.executable, "-W", "error", "run.py"]
-    deaths = {"killed-exploring": (17, "between"), "killed-later": (43, "between"), "killed-writing": (37, "writing")}
-    for folder, (step, when) in deaths.items():
-        command = [*script, folder, str(step), when]
-        process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+
+    def run(*arguments: str | int) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-W", "error", "run.py", *map(str, arguments)]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+
+    process = run("whole", "nothing", -1)
+    assert process.returncode == 0, process.stderr
+    deaths = {"exploring": (17, "between"), "later": (43, "between"), "writing": (37, "writing")}
+    for folder, (step, what) in deaths.items():
+        process = run(folder, what, step)
         assert process.returncode == -signal.SIGKILL, process.stderr
         _, facts = checkpoint.load(tmp_path / folder / "checkpoint.npz")
-        assert facts["step"] == (step if when == "writing" else step - 3)
-    process = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=200)
-    assert process.returncode == 0, process.stderr
+        assert facts["step"] == (step if what == "writing" else step - 3)
+        process = run(folder, "resume", -1)
+        assert process.returncode == 0, process.stderr
     with np.load(tmp_path / "whole.npz") as file:
         whole = dict(file)
     assert len(whole["losses"]) == 50 and whole["losses"][-1] < whole["losses"][0]
-    for folder, (step, when) in deaths.items():
+    for folder, (step, what) in deaths.items():
         with np.load(tmp_path / f"{folder}.npz") as resumed:
-            assert resumed["began"] == (step if when == "writing" else step - 3)
+            assert resumed["began"] == (step if what == "writing" else step - 3)
             for name in whole.keys() - {"began"}:
                 np.testing.assert_array_equal(resumed[name], whole[name], err_msg=f"{folder}, {name}")
 
@@ -261,7 +262,7 @@ def test_processes_find_the_same(alone, caplog, count):
         if count == 2:
             first = workers.pool
             values = {GREEN: alone.values[GREEN], COLOUR: alone.values[COLOUR]}
-            tasks = [Task(i % 2, 256, 64, i) for i in range(6)]
+            tasks = [Task(i % 2, 160, 64, i) for i in range(6)]
             timer = threading.Timer(0.1, os.kill, (next(iter(first._processes)), signal.SIGKILL))
             timer.start()
             with caplog.at_level(logging.WARNING, logger=executors.__name__):
@@ -269,17 +270,13 @@ def test_processes_find_the_same(alone, caplog, count):
             timer.join()
             assert workers.pool is not first and "a worker died (1 of 4 tries)" in caplog.text
             assert len({gradient.loss for gradient in found}) == 6
-            here = Renderer(posed)
-            for view in here.views:
-                view.picture()
-            expected = here.gradient(values, tasks[5])
+            expected = Renderer(posed).gradient(values, tasks[5])
             assert found[5].loss == pytest.approx(expected.loss, rel=1e-5)
             assert_same(fit(posed, executor=workers), alone)
     assert not workers.pool._processes
 
 
-def test_workers_that_always_die_end_the_fit(caplog):
-    """Those of a problem that cannot be read by them do not: its error comes back."""
+def test_there_must_be_a_worker():
     with pytest.raises(ValueError, match="workers must be >= 1, got 0"):
         inverse.Processes(shared(), 0)
 

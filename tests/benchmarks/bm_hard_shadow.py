@@ -35,7 +35,7 @@ METHODS = {OURS: {"type": OURS}, PEER: {"type": PEER}}
 
 NOTES = {
     "spot_cube": "A cube and its shadow on a floor, under a spot; the cube moves.",
-    "sun_turns": "The same under the sun, which turns.",
+    "sun_cube": "The same under the sun. (If the sun turns, the peer finds nothing to differentiate, and raises.)",
     "lit_room_camera": "A closed room with a point light; the camera moves.",
 }
 LIGHTS = (1, 3, 10, 30, 96)
