@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
@@ -153,9 +154,9 @@ def fit(
     ----------
     problem : what to fit. Paths in it are relative to the working directory.
     out : folder for checkpoints and the problem. The result itself is written by `rimlight.inverse.write`.
-    resume : go on from the checkpoint in `out`. With one thread (`drjit.set_thread_count(1)`) the result is bit by bit
-        that of a fit that was not interrupted; with several, sums of gradients differ in their last bits, in any two
-        runs alike.
+    resume : go on from the checkpoint in `out`. With one thread (`Problem.threads`) the result is bit by bit that of
+        a fit that was not interrupted, if each is the only one of its process; with several, sums of gradients differ
+        in their last bits, in any two runs alike.
     executor : evaluates gradients elsewhere. Default: here, one after the other.
     tensorboard : write loss and errors into `out` for TensorBoard. Needs the package tensorboardX.
     progress : show a bar on standard error.
@@ -183,6 +184,8 @@ class Run:
     ):
         self.problem = problem
         self.file = None if out is None else Path(out) / "checkpoint.npz"
+        if problem.threads is not None:
+            dr.set_thread_count(problem.threads)
         self.renderer = Renderer(problem)
         for view in self.renderer.views:
             view.picture()

@@ -164,6 +164,9 @@ class Problem:
     """Record the step once and replay it, where integrator and sensor allow that."""
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
+    threads: int | None = None
+    """Threads of this process. With 1, a fit that is repeated or resumed ends with the same numbers, bit by bit.
+    Default: all."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -183,7 +186,7 @@ def check(problem: Problem) -> None:
         raise InputError("fit: nothing is free, add a table [[free]]")
     if not problem.target or not problem.stage:
         raise InputError("fit: a fit needs at least one target and one stage")
-    at_least = {"parts": 1, "seed": 0, "max_bad": 1, "patience": 1, "seconds": 0, "clip": 0}
+    at_least = {"parts": 1, "seed": 0, "threads": 1, "max_bad": 1, "patience": 1, "seconds": 0, "clip": 0}
     _at_least("", problem, at_least)
     for name in ("momentum", "smooth_scale"):
         if not 0 <= getattr(problem, name) < 1:

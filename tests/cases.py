@@ -784,7 +784,7 @@ CASES = [
     Case("led_cube", hard_shadow(led), SIDE, 6e-3, 0.02, spp=1024),
     Case("led_moves", hard_shadow(led), {"key": "lamp.position", "direction": [1, 0.3, 0.2]}, 6e-3, 0.02, spp=1024),
     Case("distant_cube", hard_shadow(distant()), SIDE, 6e-3, 0.02, spp=1024, noisy=True),
-    Case("distant_cube_turn", hard_shadow(distant()), TURN, 6e-3, 0.02, spp=1024, noisy=True),
+    Case("distant_cube_turn", hard_shadow(distant()), TURN, 6e-3, 0.02, spp=1024, runs=72),
     Case("distant_lights", hard_shadow(distant()), DIRECTIONS, 6e-3, 0.02, spp=1024),
     Case("distant_camera", hard_shadow(distant()), CAMERA_X, 6e-3, 0.02, spp=1024, noisy=True),
     Case("discs_cube", hard_shadow(distant(5)), SIDE, 6e-3, 0.02, spp=1024, runs=24, noisy=True),
