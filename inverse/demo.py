@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import gc
 import html
 import time
@@ -19,8 +18,10 @@ import rimlight
 from rimlight import pictures, scenes
 from rimlight.edge_sampling import Motion, derivative_image, finite_differences
 from rimlight.edge_sampling.exr import replacing
-from rimlight.inverse.fitting import fit
-from rimlight.inverse.reproduce import problem_of
+
+from . import page
+from .fitting import fit
+from .reproduce import problem_of
 
 SPP = 256  # samples per pixel of one derivative
 RENDERS = 4  # derivatives to average; the first one pays for the compiler and is not timed
@@ -193,15 +194,6 @@ def _free() -> None:
 
 # ------------------------------------------------------------------ page
 
-STYLE = """
-body { max-width: 74rem; margin: 2rem auto; padding: 0 1.5rem; font: 17px/1.55 system-ui, sans-serif; color: #1c2530; }
-h1 { font-size: 1.9rem; margin-bottom: 0; }
-h2 { font-size: 1.25rem; margin: 2.6rem 0 .2rem; }
-p { max-width: 46rem; margin: .4rem 0 .8rem; }
-img { max-width: 100%; display: block; }
-footer { margin-top: 3rem; color: #66707c; font-size: .85rem; }
-"""
-
 INTRODUCTION = (
     "What happens to a picture when an object moves? At its outline a pixel jumps from one colour to another, and "
     "automatic differentiation sees nothing there. Rimlight adds the missing term to Mitsuba 3 by sampling the edges "
@@ -223,17 +215,11 @@ def write_page(out: Path, sections: list[Section], seconds: float) -> None:
         f"{dr.thread_count()} threads; made in {seconds:.0f} s. Times are those of one derivative at {SPP} samples per "
         f"pixel, compiled; errors are those of the mean of {RENDERS}."
     )
-    page = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width">\n<title>Rimlight: derivatives of pictures</title>\n'
-        f"<style>{STYLE}</style>\n</head>\n<body>\n<h1>Rimlight</h1>\n<p>{INTRODUCTION}</p>\n"
-        + "\n".join(parts)
-        + f"\n<footer>{html.escape(footer)}</footer>\n</body>\n</html>\n"
-    )
+    head = f"<h1>Rimlight</h1>\n<p>{INTRODUCTION}</p>"
+    body = "\n".join([head, *parts, f"<footer>{html.escape(footer)}</footer>"])
     with replacing(out / "index.html") as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page.page("Rimlight: derivatives of pictures", body), encoding="utf-8")
 
 
 def _image(file: Path, text: str) -> str:
-    data = base64.b64encode(file.read_bytes()).decode("ascii")
-    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
+    return f'<img alt="{html.escape(text)}" src="{page.data_uri(file.read_bytes(), "image/png")}">'

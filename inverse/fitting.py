@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from . import checkpoint, free_parameters, losses
 from . import problem as problems
-from .free_parameters import Parameter, to_numpy
+from .free_parameters import to_numpy
 from .optimisers import Optimiser
 from .problem import Problem, Stage
 from .renderer import Gradient, Renderer, Task, derived_seed
@@ -505,11 +505,6 @@ def _board(folder: Path) -> Any:
             "fit: a log for TensorBoard needs the package tensorboardX: pip install tensorboardX"
         ) from None
     return SummaryWriter(str(folder))
-
-
-def parameters_of(fit: Fit) -> list[Parameter]:
-    """The free parameters of a fit, as its scene has them."""
-    return free_parameters.find(fit.problem.free, Renderer(fit.problem).params)
 
 
 def summary(fit: Fit) -> str:

@@ -174,6 +174,7 @@ def fit() -> str:
             "# Made by rimlight.scenes.room",
             'scene = "room.xml"',
             'integrator = { type = "prb_edge", max_depth = 5 }\n',
+            "[[target]]\nspp = 512\n",
             '[[free]]\nkey = "camera.to_world"\nkind = "pose"\nrate = 0.02\nturn_rate = 0.01',
             "start = [0.15, -0.1, 0.12, 4, -5, 3]\n",
             entry(diffuse, "material", 0.03, [0.5]),
