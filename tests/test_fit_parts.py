@@ -46,6 +46,7 @@ RICH = Problem(
     max_bad=2,
     freeze=False,
     variant="cuda_ad_rgb",
+    threads=3,
 )
 HEAD = 'scene = "a.xml"\n'
 FREE = '[[free]]\nkey = "a"\nkind = "shape"\n'
