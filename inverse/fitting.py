@@ -24,7 +24,7 @@ from . import problem as problems
 from .free_parameters import to_numpy
 from .optimisers import Optimiser
 from .problem import Problem, Stage
-from .renderer import Gradient, Renderer, Task, derived_seed
+from .renderer import MAX_SAMPLES, Gradient, Renderer, Task, derived_seed
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class Progress:
     errors : label -> one number before each step, and one at the end, if the truth is known.
     frames : (step, latents) for an animation.
     skipped : gradients that were not finite; bad : of them, without a finite one since.
-    touched : latents whose gradient was ever not zero.
+    touched : names of parameters whose gradient was ever not zero.
     best_loss, best_error, best : smallest mean of the loss over `WINDOW` steps of the present segment, its standard
         error, and the latents then.
     fell : last iteration of the segment at which the loss had fallen.
@@ -199,7 +199,9 @@ class Run:
         self.plan = [*explored, *map(Segment, problem.stage[1:])]
         self.total = sum(segment.stage.iterations for segment in self.plan)
         self.progress = Progress()
-        self._board = _board(self.file.parent) if tensorboard and self.file is not None else None
+        if tensorboard and self.file is None:
+            raise ValueError("fit: to write a log for TensorBoard, name a folder")
+        self._board = _board(self.file.parent) if tensorboard else None
         self._stop = False
         self._disk_failed = False
         if resume:
@@ -241,6 +243,8 @@ class Run:
                     self._save()
                     saved = time.monotonic()
         self._save()
+        if self._board is not None:
+            self._board.close()
         return self._result(status)
 
     def step(self) -> None:
@@ -318,8 +322,8 @@ class Run:
         now, segment = self.progress, self.plan[self.progress.segment]
         last = now.segment == len(self.plan) - 1
         if segment.start is not None:
-            loss = float(np.mean(now.losses[-min(WINDOW, now.iteration) :]))
-            now.found.append((loss if np.isfinite(loss) else float("inf"), self._latents()))
+            loss = self._recent()[0] if np.isfinite(now.losses[-1]) else float("inf")
+            now.found.append((loss, self._latents()))
             if last:
                 self._restart_at_best_start()
         elif last:
@@ -334,7 +338,7 @@ class Run:
         now, segment = self.progress, self.plan[self.progress.segment]
         now.best_loss, now.best, now.fell = float("inf"), {}, 0
         if segment.start is not None:
-            self._restart(self._start(segment.start))
+            self.optimiser.restart(self._start(segment.start))
         elif now.found:
             self._restart_at_best_start()
             now.found = []
@@ -345,18 +349,19 @@ class Run:
         if now.best:
             mean, error = self._recent()
             if not mean <= now.best_loss + SURE * np.hypot(error, now.best_error):
-                self._restart(now.best)
+                self.optimiser.restart(now.best)
 
     def _recent(self) -> tuple[float, float]:
-        """Mean of the last losses that are finite, and its standard error."""
-        recent = np.array(self.progress.losses[-WINDOW:])
-        recent = recent[np.isfinite(recent)]
-        if len(recent) < 2:
+        """Mean of the last losses of the segment that are finite, and its standard error."""
+        now = self.progress
+        recent = [x for x, k in zip(now.losses, now.segments, strict=True) if k == now.segment][-WINDOW:]
+        recent = [x for x in recent if np.isfinite(x)]
+        if not recent:
             return float("inf"), 0.0
-        return float(recent.mean()), float(recent.std(ddof=1) / np.sqrt(len(recent)))
+        return float(np.mean(recent)), float(np.std(recent) / np.sqrt(max(len(recent) - 1, 1)))
 
     def _restart_at_best_start(self) -> None:
-        self._restart(min(self.progress.found, key=lambda entry: entry[0])[1])
+        self.optimiser.restart(min(self.progress.found, key=lambda entry: entry[0])[1])
 
     def _start(self, number: int) -> dict[str, np.ndarray]:
         if number == 0:
@@ -365,9 +370,6 @@ class Run:
         spread = self.problem.starts
         scattered = [p.scatter(rng, spread.move, spread.turn, spread.value) for p in self.parameters]
         return {name: latent for of_one in scattered for name, latent in of_one.items()}
-
-    def _restart(self, latents: Mapping[str, np.ndarray]) -> None:
-        self.optimiser.restart(latents)
 
     def _latents(self) -> dict[str, np.ndarray]:
         return dict(self.optimiser.latents())
@@ -454,7 +456,7 @@ class Run:
         latents = self._latents()
         self._note_errors(latents)
         values = self._values(latents)
-        spp = lambda view: max(1, min(FINAL_SPP, 2**22 // (view.size[0] * view.size[1])))
+        spp = lambda view: max(1, min(FINAL_SPP, MAX_SAMPLES // (view.size[0] * view.size[1])))
         views, measures, floors = [], [], []
         for i, view in enumerate(self.renderer.views):
             task = Task(i, None, spp(view), derived_seed(self.problem.seed, 2**31, i))

@@ -64,11 +64,9 @@ class Parameter(ABC):
             found[name] = self.legal(name, (start + change).astype(np.float32))
         return found
 
+    @abstractmethod
     def errors(self, latents: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Distance from the truth, by a label with its unit."""
-        return {
-            f"{name}": float(np.sqrt(np.mean(np.square(latents[name] - truth)))) for name, truth in self.truth.items()
-        }
 
 
 class RigidBody(Parameter):
@@ -182,7 +180,9 @@ class Values(Parameter):
         self.key, self.kind = key, type(initial)
         self.shape = initial.shape if dr.is_tensor_v(initial) else None
         truth = to_numpy(initial).ravel().astype(np.float32)
-        low, high = next(((a, b) for pattern, a, b in RANGES if re.search(pattern, key)), (-np.inf, np.inf))
+        inwards = reversed(key.split(".")[1:])  # without the identifier, which says nothing
+        ranges = ((a, b) for name in inwards for pattern, a, b in RANGES if re.search(pattern, name))
+        low, high = next(ranges, (-np.inf, np.inf))
         self.low = low if free.lower is None else free.lower
         self.high = high if free.upper is None else free.upper
         counts = {1, len(truth)}

@@ -28,7 +28,7 @@ NOT_REPLAYED = ("ThinLensCamera", "OrthographicCamera")
 #: Integrators of Mitsuba that can be replayed; ours say so themselves.
 REPLAYED = ("prb", "prb_basic", "path", "direct")
 
-#: Samples of one launch; more are split.
+#: Samples of one launch, where a picture may be the mean of several.
 MAX_SAMPLES = 2**22
 
 
@@ -125,7 +125,13 @@ class View:
         self.film = mi.traverse(self.sensor)
         #: The last channel of the film, which is not compared.
         self.alpha = mi.has_flag(self.sensor.film().flags(), mi.FilmFlags.Alpha)
-        self.size = tuple(int(n) for n in reversed(self.sensor.film().crop_size()))
+        film = self.sensor.film()
+        self.size = tuple(int(n) for n in reversed(film.crop_size()))
+        if tuple(film.crop_size()) != tuple(film.size()) and any(s.resolution for s in renderer.problem.stage):
+            raise ValueError(
+                f"fit: target.{number}: the film is cropped, so that its resolution cannot change; leave out "
+                "resolution in the stages, or the crop in the scene"
+            )
         self.arranged: set[str] = set()
         self.functions: dict[Any, tuple[Callable, Callable]] = {}
         self.kinds = {}
@@ -265,4 +271,5 @@ def _no_collection() -> Iterator[None]:
 
 def derived_seed(*numbers: int) -> int:
     """A seed for random numbers that are independent of those of other numbers."""
-    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+    # With their count: NumPy takes (7,) and (7, 0) for the same.
+    return int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1)[0])

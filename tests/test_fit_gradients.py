@@ -143,6 +143,7 @@ def test_gradient_is_not_biased_by_shared_samples(room, monkeypatch, shared):
 
 
 def test_seeds_differ():
+    assert renderer.derived_seed(0, 7) != renderer.derived_seed(0, 7, 0, 0)  # of targets and of steps
     seeds = {renderer.derived_seed(a, b, c, d) for a in range(2) for b in range(50) for c in range(3) for d in range(4)}
     assert len(seeds) == 2 * 50 * 3 * 4
     assert all(0 <= seed < 2**32 for seed in seeds)

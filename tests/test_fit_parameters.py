@@ -194,6 +194,19 @@ def test_legal_ranges(params, key, low, high, options):
     np.testing.assert_array_equal(shown.ravel(), wide)
 
 
+@pytest.mark.parametrize(
+    ("key", "high"),
+    [
+        ("weight.emitter.radiance.value", np.inf),
+        ("scale.bsdf.reflectance.color0.value", 1),
+        ("lamp.weight.intensity.value", np.inf),
+    ],
+)
+def test_names_of_objects_say_nothing_about_ranges(key, high):
+    parameter = free_parameters.Values(key, Free(key=(key,), kind="light"), key, mi.Color3f(0.5))
+    assert (parameter.low, parameter.high) == (0, high)
+
+
 def test_directions_stay_of_unit_length(params):
     key = "torus.vertex_normals"
     normals = found(params, key, rate=0.2, unit_length=True, start=(3.0,))

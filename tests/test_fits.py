@@ -166,6 +166,15 @@ def test_noise_of_the_loss_does_not_choose_the_result():
     assert np.abs(found.values[COLOUR] - executor.seen[-1]).max() < 0.021  # a step from there
 
 
+def test_log_for_tensorboard(tmp_path):
+    pytest.importorskip("tensorboardX")
+    inverse.fit(triangles(MATERIAL, steps=3), executor=Valley(), out=tmp_path, tensorboard=True, progress=False)
+    (file,) = tmp_path.glob("events.out.tfevents.*")
+    assert b"loss" in file.read_bytes()
+    with pytest.raises(ValueError, match="name a folder"):
+        fit(triangles(MATERIAL), executor=Valley(), tensorboard=True)
+
+
 def test_patience_ends_a_stage():
     flat = lambda c: (1.0, np.full(3, 1e-3))
     stage = Stage(iterations=500)

@@ -17,6 +17,7 @@ from rimlight import inverse
 from rimlight.inverse import Free, Problem
 from rimlight.loading import InputError, expected
 
+from ._commands import REFUSAL
 from ._loading import at_least, check_output
 
 #: What is shown by --help before there is a file.
@@ -56,8 +57,8 @@ class Fit:
                 raise InputError(f'nothing of the kind "{self.kind}" is free in "{self.config}", only {kinds}')
             problem = dataclasses.replace(problem, free=free)
         logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
-        # ValueError and OSError: bad input. RuntimeError: what our integrators refuse.
-        with ExitStack() as stack, expected(ValueError, OSError), expected(RuntimeError, pattern=r"^[\w ]+: "):
+        # Bad input, and what our integrators refuse. All else is a bug, and shall look like one.
+        with ExitStack() as stack, expected(OSError), expected(ValueError, RuntimeError, pattern=REFUSAL):
             executor = None
             if self.cluster is not None:
                 executor = stack.enter_context(inverse.Cluster(problem, self.cluster))
@@ -127,7 +128,7 @@ class Reproduce:
         at_least(1, seeds=self.seeds)
         check_output(self.out, folder=True)
         logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
-        with expected(ValueError, OSError):
+        with expected(OSError), expected(ValueError, RuntimeError, pattern=REFUSAL):
             outcomes = reproduce.reproduce(self.figure, self.out, seeds=range(self.seeds), peer=self.peer)
         print("\n".join(reproduce.table(outcomes)))
         return 0

@@ -250,9 +250,9 @@ class Scattering:
         return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
 
 
-#: Cosine below which a curved surface is taken to stand still, as a fixed ray meets it. Where the ray meets it moves as
-#: 1 / cos, and single precision does not know cosines of 1e-4: single samples would outweigh all others. The loss is of
-#: this order, relative to what the surface itself contributes.
+#: Cosine below which a surface that is no mesh is taken to stand still, as a fixed ray meets it. Where a curved one is
+#: met moves as 1 / cos, and single precision does not know cosines of 1e-4: single samples would outweigh all others.
+#: The loss is of this order, relative to what the surface itself contributes.
 GRAZING = 1e-3
 
 
