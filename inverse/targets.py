@@ -6,7 +6,8 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from skimage.transform import downscale_local_mean, resize
+from scipy.interpolate import interp1d
+from skimage.transform import resize
 
 from rimlight.edge_sampling.exr import read_exr
 from rimlight.loading import one_line
@@ -103,19 +104,22 @@ def srgb_to_linear(image: np.ndarray) -> np.ndarray:
 
 
 def smaller(image: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """A target for a film of another size: (H, W, C) and (H, W). What does not count stays out."""
+    """A target for a film of another size: (H, W, C) and (H, W). A pixel counts if all of it does: what a render shows
+    in the rest of it, nothing can leave out."""
     if image.shape[:2] == size:
         return image, weight
-    share = resample(weight, size)
-    return resample(image * weight[..., None], size) / np.maximum(share, 1e-6)[..., None], share
+    whole = resample((weight > 0).astype(np.float32), size) > 1 - 1e-4
+    return resample(image, size), resample(weight, size) * whole
 
 
 def resample(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A picture of another size, (H, W, ...): means of blocks where that is possible, as a box filter makes them."""
-    if image.shape[:2] == size:
-        return image
-    factors = [old // new for old, new in zip(image.shape, size, strict=False)]
-    if all(f * new == old for f, new, old in zip(factors, size, image.shape, strict=False)):
-        return downscale_local_mean(image, (*factors, *[1] * (image.ndim - 2))).astype(np.float32)
-    reduces = any(new < old for new, old in zip(size, image.shape, strict=False))
-    return resize(image, size, order=1, anti_aliasing=reduces, preserve_range=True).astype(np.float32)
+    """A picture of another size, (H, W, ...): means over the new pixels, as a box filter makes them; between pixels of
+    a picture that is too small, linear."""
+    if any(new > old for new, old in zip(size, image.shape, strict=False)):
+        return resize(image, size, order=1, preserve_range=True).astype(np.float32)
+    for axis, new in enumerate(size):
+        old = image.shape[axis]
+        integral = np.insert(np.cumsum(image, axis, np.float64), 0, 0, axis)
+        at_borders = interp1d(np.arange(old + 1), integral, axis=axis)(np.linspace(0, old, new + 1))
+        image = np.diff(at_borders, axis=axis) * (new / old)
+    return image.astype(np.float32)

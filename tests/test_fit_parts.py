@@ -307,17 +307,27 @@ def test_what_is_not_finite_is_refused_or_masked(tmp_path, bad):
     assert not targets.read(target, (6, 8))[1][2, 3:5].any()
 
 
-def test_smaller_targets_are_means_of_blocks(tmp_path):
+@pytest.mark.parametrize("size", [(3, 4), (4, 5), (5, 8)])
+def test_smaller_targets_are_means_over_their_pixels(tmp_path, size):
     image = random_picture()
     file = save(tmp_path / "a.exr", image)
-    read, _ = targets.read(Target(file=file, resize=True), (3, 4))
-    blocks = image.reshape(3, 2, 4, 2, 3)
-    np.testing.assert_allclose(read, blocks.mean((1, 3)), rtol=1e-6)
-    weight = np.ones((6, 8), np.float32)
-    weight[0], image[0] = 0, 1e6  # does not count, and shall not shine into the row below
+    read, _ = targets.read(Target(file=file, resize=True), size)
+    (height, width), (rows, columns) = image.shape[:2], size
+    fine = image.repeat(rows, axis=0).repeat(columns, axis=1)  # of which old and new pixels are blocks
+    means = fine.reshape(rows, height, columns, width, 3).mean((1, 3))
+    np.testing.assert_allclose(read, means, rtol=1e-5)
+
+
+def test_pixels_that_count_in_part_do_not_count_when_smaller():
+    """A render would show all of them."""
+    image, weight = random_picture(), np.ones((6, 8), np.float32)
+    weight[0], image[0] = 0, 1e6
+    weight[4, 2] = 0.5
     read, share = targets.smaller(image, weight, (3, 4))
-    np.testing.assert_allclose(read[0], blocks[0, 1].mean(1), rtol=1e-5)
-    np.testing.assert_allclose(share, np.array([[0.5], [1], [1]]) * np.ones(4))
+    np.testing.assert_allclose(read[1:], image.reshape(3, 2, 4, 2, 3).mean((1, 3))[1:], rtol=1e-5)
+    expected = np.ones((3, 4))
+    expected[0], expected[2, 1] = 0, 0.875
+    np.testing.assert_allclose(share, expected)
 
 
 def test_pictures_of_another_size(tmp_path):
