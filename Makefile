@@ -22,7 +22,7 @@ demo: setup
 
 # Two workers, each with all threads: the compiler, not the kernels, is what small tests wait for
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
 
 # All of them take about half an hour; or one: make bench NAME=scaling
 NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illumination scaling rig

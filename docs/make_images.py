@@ -1,10 +1,12 @@
 """Make the pictures of the README and the documentation:  python docs/make_images.py
 
-About five minutes on two cores. Writes docs/images/overview.png.
+About seven minutes on two cores. Writes docs/images/overview.png, and adversarial.png, which needs the extra
+`adversarial`.
 """
 
 from __future__ import annotations
 
+import tempfile
 import time
 from pathlib import Path
 
@@ -61,8 +63,36 @@ def overview(path: Path) -> None:
     )
 
 
+def adversarial(path: Path) -> None:
+    """The stop sign before and after the fit of figure 10, and what the network says in each step."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from rimlight import inverse, pictures
+    from rimlight.scenes import traffic_sign
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = inverse.fit(inverse.read(traffic_sign.write(Path(folder))))
+    (view,) = found.views
+    print(f"{found.seconds:.1f} s, {found.measures[0]}")
+    figure = Figure(figsize=(11, 3.5), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    before, after, curves = figure.subplots(1, 3, width_ratios=(1, 1, 1.3))
+    for axes, image, title in ((before, view.start, "before"), (after, view.result, "after")):
+        axes.imshow(pictures.to_srgb(image))
+        axes.set_title(title, fontsize=9)
+        axes.set_axis_off()
+    for label, probability in found.scores.items():
+        curves.plot(probability, label=label)
+    curves.set(xlabel="step", ylabel="probability")
+    curves.grid(alpha=0.3)
+    curves.legend()
+    figure.savefig(path)
+
+
 if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     IMAGES.mkdir(exist_ok=True)
     overview(IMAGES / "overview.png")
+    adversarial(IMAGES / "adversarial.png")

@@ -216,6 +216,7 @@ class ShadowBoundary:
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl = dr.select(active, n_dl, 0)
+            u = dr.select(active, u, 0)  # what is not finite would spoil pixels, even with the value 0
             if projection.attached:
                 # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
                 dr.eval(jump, n_dl, active, seen, ray, met, onwards, light, numbers, e, y, far, facing, lift, u)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import math
 import signal
 import threading
 import time
@@ -19,7 +20,9 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import checkpoint, free_parameters, losses
+from rimlight.loading import one_line
+
+from . import checkpoint, classifier, free_parameters, losses
 from . import problem as problems
 from .free_parameters import to_numpy
 from .optimisers import Optimiser
@@ -46,6 +49,9 @@ FRAMES = 48
 #: Samples per pixel of the pictures of a result.
 FINAL_SPP = 256
 
+#: At most, of the derivative image of a result.
+DERIVATIVE_SPP = 64
+
 #: Evaluates tasks, in their order.
 Executor = Callable[[Mapping[str, np.ndarray], Sequence[Task]], list[Gradient]]
 
@@ -65,6 +71,7 @@ class Progress:
     segment, iteration : place in the plan. step : of all.
     losses, segments, times : of each step; the last in seconds, at its end.
     errors : label -> one number before each step, and one at the end, if the truth is known.
+    scores : label -> probability at the render of each step, the mean of the tasks, with the norm "classifier".
     frames : (step, latents) for an animation.
     skipped : gradients that were not finite; bad : of them, without a finite one since.
     touched : names of parameters whose gradient was ever not zero.
@@ -82,6 +89,7 @@ class Progress:
     segments: list[int] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     errors: dict[str, list[float]] = field(default_factory=dict)
+    scores: dict[str, list[float]] = field(default_factory=dict)
     frames: list[tuple[int, dict[str, np.ndarray]]] = field(default_factory=list)
     skipped: int = 0
     bad: int = 0
@@ -114,10 +122,13 @@ class Fit:
     losses, segments, times : (steps,), loss at a noisy render before each step, the number of its segment, and seconds
         in the loop at its end.
     errors : label -> (steps + 1,), distance from the truth, where that is known.
+    scores : label -> (steps,), probability of a class at a noisy render before each step, with the norm "classifier".
     silent : names of parameters whose gradient was always 0: the pictures do not depend on them.
     skipped : steps that were left out because their gradient was not finite.
     seconds : in the loop. views : pictures before and after. measures : of each view, label -> before and after.
     floors : root mean square error of each view at the truth, where it is known: the noise of the pictures.
+    derivative : (H, W, C), of the first view at the result, as all free parameters go on the way that they came from
+        the start, once: what of the picture depends on them, and how. None: the integrator cannot do that.
     frames : (step, picture of the first view) from start to end.
     """
 
@@ -136,7 +147,9 @@ class Fit:
     views: list[ViewOfFit]
     measures: list[dict[str, tuple[float, float]]]
     floors: list[float]
+    derivative: np.ndarray | None
     frames: list[tuple[int, np.ndarray]]
+    scores: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def fit(
@@ -190,7 +203,8 @@ class Run:
         for view in self.renderer.views:
             view.picture()
         self.parameters = free_parameters.find(problem.free, self.renderer.params)
-        self.truth_is_known = all(target.file is None for target in problem.target)
+        compares = problem.loss.norm != "classifier"
+        self.truth_is_known = compares and all(target.file is None for target in problem.target)
         self.optimiser = Optimiser(self.parameters, problem)
         self.executor: Executor = executor or (lambda values, tasks: [self.renderer.gradient(values, t) for t in tasks])
         self.start = self._latents()
@@ -252,7 +266,7 @@ class Run:
         now, segment = self.progress, self.plan[self.progress.segment]
         stage = segment.stage
         attached = self.optimiser.values()
-        values = {key: to_numpy(value) for of_one in attached for key, value in of_one.items()}
+        values = {key: to_numpy(value) for key, value in attached.items()}
         tasks = [
             Task(i, stage.resolution, stage.spp, derived_seed(self.problem.seed, now.step, i, part))
             for i in range(len(self.problem.target))
@@ -264,12 +278,12 @@ class Run:
             key: sum((f.gradients[key] for f in found if key in f.gradients), np.float32(0)) / len(found)
             for key in values
         }
-        self._note(loss)
+        self._note(loss, {label: float(np.mean([f.scores[label] for f in found])) for label in found[0].scores})
         if np.isfinite(loss) and all(np.isfinite(g).all() for g in gradients.values()):
             now.bad = 0
             done = now.iteration / max(stage.iterations - 1, 1)
-            for parameter, of_one in zip(self.parameters, attached, strict=True):
-                if any(np.any(gradients[key]) for key in of_one):
+            for parameter in self.parameters:
+                if any(np.any(gradients[key]) for key in parameter.keys):
                     now.touched.add(parameter.name)
             self.optimiser.step(attached, gradients, stage.rate * stage.decay**done)
         else:
@@ -277,8 +291,8 @@ class Run:
             now.bad += 1
         if self._board is not None:
             self._board.add_scalar("loss", loss, now.step)
-            for label, errors in now.errors.items():
-                self._board.add_scalar(label, errors[-1], now.step)
+            for label, numbers in (now.errors | now.scores).items():
+                self._board.add_scalar(label, numbers[-1], now.step)
         now.step += 1
         now.iteration += 1
         if now.step == WINDOW:
@@ -291,7 +305,7 @@ class Run:
         """Names of parameters whose gradient was always 0."""
         return [p.name for p in self.parameters if p.name not in self.progress.touched]
 
-    def _note(self, loss: float) -> None:
+    def _note(self, loss: float, scores: Mapping[str, float]) -> None:
         """Keep what is known before a step."""
         now = self.progress
         latents = self._latents()
@@ -300,10 +314,12 @@ class Run:
         if now.step % every == 0:
             now.frames.append((now.step, latents))
         now.losses.append(loss)
+        for label, score in scores.items():
+            now.scores.setdefault(label, []).append(score)
         now.segments.append(now.segment)
         if now.iteration + 1 >= WINDOW:
             mean, error = self._recent()
-            if mean < now.best_loss * (1 - FALL):
+            if now.best_loss - mean > FALL * abs(mean):
                 now.fell = now.iteration
             if mean < now.best_loss:
                 now.best_loss, now.best_error, now.best = mean, error, latents
@@ -377,8 +393,8 @@ class Run:
     def _shown(self) -> dict[str, str]:
         now = self.progress
         shown = {"loss": f"{now.losses[-1]:.2e}"}
-        for label, errors in list(now.errors.items())[:2]:
-            shown[label.split(" (")[0]] = f"{errors[-1]:.2e}"
+        for label, numbers in list((now.errors | now.scores).items())[:2]:
+            shown[label.split(" (")[0]] = f"{numbers[-1]:.2e}"
         return shown
 
     # ---------------------- Interruption ----------------------
@@ -456,7 +472,8 @@ class Run:
         latents = self._latents()
         self._note_errors(latents)
         values = self._values(latents)
-        spp = lambda view: max(1, min(FINAL_SPP, MAX_SAMPLES // (view.size[0] * view.size[1])))
+        # A square, as stratified samplers want it.
+        spp = lambda view: max(math.isqrt(min(FINAL_SPP, MAX_SAMPLES // (view.size[0] * view.size[1]))), 1) ** 2
         views, measures, floors = [], [], []
         for i, view in enumerate(self.renderer.views):
             task = Task(i, None, spp(view), derived_seed(self.problem.seed, 2**31, i))
@@ -464,13 +481,25 @@ class Run:
             target, weight = view.picture()
             views.append(ViewOfFit(before, after, target, weight))
             compared = [losses.measures(image, target, weight) for image in (before, after)]
+            if self.problem.loss.norm == "classifier":
+                said = [classifier.probabilities(self.problem.loss, image) for image in (before, after)]
+                compared = [
+                    {f"probability of {label}": p for label, p in of_one.items()} | rest
+                    for of_one, rest in zip(said, compared, strict=True)
+                ]
             measures.append({label: (compared[0][label], compared[1][label]) for label in compared[0]})
             if self.truth_is_known:
                 again = self.renderer.image(self._values(self._truth()), task)
                 floors.append(losses.root_mean_square(again - target, weight))
-        small = Task(0, min(self.renderer.views[0].size[1], 256), 32, derived_seed(self.problem.seed, 2**31 + 1))
+        small = Task(0, min(self.renderer.views[0].size[1], 256), 36, derived_seed(self.problem.seed, 2**31 + 1))
         steps = [*now.frames, (now.step, latents)]
         frames = [(step, self.renderer.image(self._values(at), small)) for step, at in steps]
+        on = Task(0, None, min(spp(self.renderer.views[0]), DERIVATIVE_SPP), derived_seed(self.problem.seed, 2**31 + 2))
+        derivative = None
+        try:
+            derivative = self.renderer.derivative(values, self._way(latents), on)
+        except RuntimeError as error:  # of an integrator that cannot; what was found is not lost by that
+            log.warning("there is no derivative image: %s", one_line(error))
         self.renderer.image(values, Task(0, None, 1, 0))  # leave the scene at the result
         return Fit(
             problem=self.problem,
@@ -488,15 +517,27 @@ class Run:
             views=views,
             measures=measures,
             floors=floors,
+            derivative=derivative,
             frames=frames,
+            scores={label: np.array(scores) for label, scores in now.scores.items()},
         )
+
+    def _way(self, latents: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Derivatives of the scene parameters at the result, on the straight way from the start through it."""
+        held = {name: mi.Float(latent) for name, latent in latents.items()}
+        for name, latent in held.items():
+            dr.enable_grad(latent)
+            dr.set_grad(latent, mi.Float(latents[name] - self.start[name]))
+        found = free_parameters.values(self.parameters, held)
+        dr.forward_to(found)
+        return {key: to_numpy(dr.grad(value)) for key, value in found.items()}
 
     def _truth(self) -> dict[str, np.ndarray]:
         return {name: latent for p in self.parameters for name, latent in p.truth.items()}
 
     def _values(self, latents: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         held = {name: mi.Float(latent) for name, latent in latents.items()}
-        return {key: to_numpy(value) for p in self.parameters for key, value in p.values(held).items()}
+        return {key: to_numpy(value) for key, value in free_parameters.values(self.parameters, held).items()}
 
 
 def _board(folder: Path) -> Any:
@@ -519,6 +560,7 @@ def summary(fit: Fit) -> str:
             "skipped": fit.skipped,
             "no influence": fit.silent,
             "errors": {label: [float(e[0]), float(e[-1])] for label, e in fit.errors.items()},
+            "scores": {label: [float(p[0]), float(p[-1])] for label, p in fit.scores.items()},
             "pictures": fit.measures,
             "noise of the pictures": fit.floors,
             "values": {key: value.ravel().tolist() for key, value in fit.values.items() if value.size <= 64},

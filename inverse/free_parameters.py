@@ -6,6 +6,7 @@ import difflib
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import drjit as dr
@@ -25,23 +26,28 @@ RANGES = (
 )
 
 
+#: Values of no parameter.
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
 class Parameter(ABC):
     """One entry of `Problem.free`, in a scene.
 
     name : for people; unique.
+    keys : of the scene parameters that it makes.
     free : what was asked for.
     start, truth : latent name -> array of float32; where the fit begins, and the present state of the scene, which is
         the truth if the target is rendered from it.
     """
 
-    def __init__(self, name: str, free: Free):
-        self.name, self.free = name, free
+    def __init__(self, name: str, free: Free, keys: Iterable[str]):
+        self.name, self.free, self.keys = name, free, tuple(keys)
         self.truth: dict[str, np.ndarray] = {}
         self.start: dict[str, np.ndarray] = {}
 
     @abstractmethod
-    def values(self, latents: Mapping[str, mi.Float]) -> dict[str, Any]:
-        """Scene parameters, by key, attached if the latents are."""
+    def values(self, latents: Mapping[str, mi.Float], so_far: Mapping[str, Any] = NOTHING) -> dict[str, Any]:
+        """Scene parameters, by key, attached if the latents are. so_far : those of the parameters before this one."""
 
     def rates(self) -> dict[str, float]:
         """Learning rate of each latent."""
@@ -71,10 +77,11 @@ class Parameter(ABC):
 
 class RigidBody(Parameter):
     """Vertices of meshes, or transformations, that move together by a twist: a displacement and a rotation vector about
-    a centre, both in world space. Their values at the truth are what the scene has."""
+    a centre, both in world space. Their values at the truth are what the scene has. Vertices that are free themselves
+    are displaced first; the centre stays that of the scene."""
 
     def __init__(self, name: str, free: Free, initial: Mapping[str, Any]):
-        super().__init__(name, free)
+        super().__init__(name, free, initial)
         self.initial = dict(initial)
         points = np.concatenate([_points(value) for value in initial.values()])
         #: (3,), world space.
@@ -86,12 +93,12 @@ class RigidBody(Parameter):
         start = _numbers(free.start, {6}, name, "6 numbers") if free.start else np.zeros(6)
         self.start = {self.move: start[:3].astype(np.float32), self.turn: np.radians(start[3:]).astype(np.float32)}
 
-    def values(self, latents):
+    def values(self, latents, so_far=NOTHING):
         shift, rotation = (dr.unravel(mi.Vector3f, latents[k]) for k in (self.move, self.turn))
         moved = rotate_and_shift(rotation, shift, mi.Point3f(self.centre))
         return {
             key: moved @ value if is_transform(value) else dr.ravel(moved @ dr.unravel(mi.Point3f, value))
-            for key, value in self.initial.items()
+            for key, value in ((key, so_far.get(key, initial)) for key, initial in self.initial.items())
         }
 
     def rates(self):
@@ -124,7 +131,7 @@ class Vertices(Parameter):
     """Vertex positions, one by one. Vertices of equal position stay together, so that seams do not open."""
 
     def __init__(self, name: str, free: Free, key: str, initial: mi.Float, faces: mi.UInt):
-        super().__init__(name, free)
+        super().__init__(name, free, [key])
         self.key = key
         place = np.array(initial, np.float32).reshape(-1, 3)
         _, first, weld = np.unique(place, axis=0, return_index=True, return_inverse=True)
@@ -144,7 +151,7 @@ class Vertices(Parameter):
             return np.array(self.large_steps.to_differential(mi.Float(place.ravel())), np.float32)
         return place[self.first].ravel()
 
-    def values(self, latents):
+    def values(self, latents, so_far=NOTHING):
         if self.large_steps:
             return {self.key: self.large_steps.from_differential(latents[self.key])}
         return {self.key: dr.ravel(dr.gather(mi.Point3f, latents[self.key], self.weld))}
@@ -176,7 +183,7 @@ class Values(Parameter):
     """Numbers of a material, light, texture or lens, within their legal range."""
 
     def __init__(self, name: str, free: Free, key: str, initial: Any):
-        super().__init__(name, free)
+        super().__init__(name, free, [key])
         self.key, self.kind = key, type(initial)
         self.shape = initial.shape if dr.is_tensor_v(initial) else None
         truth = to_numpy(initial).ravel().astype(np.float32)
@@ -196,7 +203,7 @@ class Values(Parameter):
             )
         self.start[key] = self.legal(key, self.start[key])
 
-    def values(self, latents):
+    def values(self, latents, so_far=NOTHING):
         return {self.key: from_flat(latents[self.key], self.kind, self.shape)}
 
     def legal(self, name, latent):
@@ -226,19 +233,18 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
     ValueError : a key is unknown, is free twice, cannot be differentiated, or `start` does not fit it.
     """
     found: list[Parameter] = []
-    seen: set[str] = set()
     for entry in free:
         for key in entry.key:
             _check_key(key, params)
-            if key in seen:
-                raise ValueError(f'fit: "{key}" is free twice')
-            seen.add(key)
         moves_whole = lambda key, kind=entry.kind: (
             is_transform(params[key]) or (kind == "pose" and key.endswith("vertex_positions"))
         )
         rigid = [key for key in entry.key if moves_whole(key)]
+        _check_free_once(entry, rigid, found)
         if rigid:
             name = _body(rigid[0]) if len(rigid) == 1 else " + ".join(map(_body, rigid[:3])) + " …" * (len(rigid) > 3)
+            if any(p.name == name for p in found):
+                name += " (whole)"
             found.append(RigidBody(name, entry, {key: _copy(params[key]) for key in rigid}))
         for key in entry.key:
             if key in rigid:
@@ -249,6 +255,18 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
             else:
                 found.append(Values(key, entry, key, _copy(params[key])))
     return found
+
+
+def _check_free_once(entry: Free, rigid: Iterable[str], found: Iterable[Parameter]) -> None:
+    """Vertices may be free one by one, and then, in a later entry, together."""
+    for key in entry.key:
+        before = [p for p in found if key in p.keys]
+        as_both = key in rigid and len(before) == 1 and isinstance(before[0], Vertices)
+        if entry.key.count(key) > 1 or (before and not as_both):
+            raise ValueError(
+                f'fit: "{key}" is free twice; vertices may be, with the kind "shape", and then, in a later entry, '
+                'with the kind "pose"'
+            )
 
 
 def _check_key(key: str, params: Any) -> None:
@@ -263,6 +281,14 @@ def _check_key(key: str, params: Any) -> None:
 
 
 # ------------------------------------------------------------------ values of scenes
+
+
+def values(parameters: Iterable[Parameter], latents: Mapping[str, mi.Float]) -> dict[str, Any]:
+    """Scene parameters of all free parameters, by key, attached if the latents are."""
+    found: dict[str, Any] = {}
+    for parameter in parameters:
+        found |= parameter.values(latents, found)
+    return found
 
 
 def to_numpy(value: Any) -> np.ndarray:

@@ -5,7 +5,7 @@ picture and the derivative image are rendered with *independent* random numbers.
 image J the mean J̄, then the mean of ∇f(I) · J is the product of the means, which for `l2` and `relative` (whose ∇f is
 linear in I) is the gradient of f(Ī), without bias. Were both made of the same samples, the covariance of I and J would
 be added. ∇f of `l1` is a sign: where the noise of I exceeds its distance from the target, the gradient is weaker than
-that of f(Ī), but of the right direction.
+that of f(Ī), but of the right direction. For the loss that compares nothing, see `classifier`.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import free_parameters
 from .free_parameters import Parameter, is_transform
 from .problem import Problem
 
@@ -35,10 +36,9 @@ class Optimiser:
             self.inner[name][name] = _own(p.start[name])
         self._latents: dict[str, np.ndarray] | None = None
 
-    def values(self) -> list[dict[str, Any]]:
-        """Scene parameters, by key, of each free parameter; attached to the latents."""
-        held = {name: inner[name] for name, inner in self.inner.items()}
-        found = [p.values(held) for p in self.parameters]
+    def values(self) -> dict[str, Any]:
+        """Scene parameters, by key, attached to the latents."""
+        found = free_parameters.values(self.parameters, {name: inner[name] for name, inner in self.inner.items()})
         dr.eval(found)
         return found
 
@@ -47,13 +47,13 @@ class Optimiser:
             self._latents = {name: np.array(inner[name], np.float32) for name, inner in self.inner.items()}
         return self._latents
 
-    def step(self, values: Sequence[Mapping[str, Any]], gradients: Mapping[str, np.ndarray], factor: float) -> None:
+    def step(self, values: Mapping[str, Any], gradients: Mapping[str, np.ndarray], factor: float) -> None:
         """Take a step.
 
         values : what `values` returned. gradients : of the loss, with respect to them, by key, flat. factor : of the
             rates.
         """
-        pairs = [(value, gradients[key]) for of_one in values for key, value in of_one.items()]
+        pairs = [(value, gradients[key]) for key, value in values.items()]
         dr.backward(sum((inner_product(value, gradient) for value, gradient in pairs), mi.Float(0)))
         found = {name: dr.grad(inner[name]) for name, inner in self.inner.items()}
         found = {name: g * self.masks[name] if name in self.masks else g for name, g in found.items()}

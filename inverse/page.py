@@ -208,10 +208,10 @@ def _kind(image: np.ndarray, kind: str = "") -> str:
     return f'class="{" ".join(names)}"'
 
 
-def compare(before: np.ndarray, result: np.ndarray, target: np.ndarray, name: str) -> str:
+def compare(before: np.ndarray, result: np.ndarray, target: np.ndarray, name: str, goal: str = "target") -> str:
     """Two pictures over each other, and a bar between them that can be dragged: result or before, and target.
 
-    before, result, target : (H, W, C), linear. name : plain text, unique within the page.
+    before, result, target : (H, W, C), linear. name : plain text, unique within the page. goal : name of the target.
     """
     left = "\n".join(
         picture(image, f"{name}: {label}", f'{_kind(image, "left")} data-name="{label}"{hidden}')
@@ -224,9 +224,9 @@ def compare(before: np.ndarray, result: np.ndarray, target: np.ndarray, name: st
     )
     return f"""<figure class="compare" style="width: {shown_width(target)}px">
 <div class="stack">
-{picture(target, f"{name}: target")}
+{picture(target, f"{name}: {goal}")}
 {left}
-<div class="bar"></div><span class="tag">result</span><span class="tag right">target</span>
+<div class="bar"></div><span class="tag">result</span><span class="tag right">{html.escape(goal)}</span>
 </div>
 <input type="range" min="0" max="100" step="any" value="50" autocomplete="off"
  aria-label="{html.escape(name)}: place of the bar between the pictures">

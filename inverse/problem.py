@@ -24,6 +24,9 @@ else:
 Kind = Literal["pose", "material", "light", "shape"]
 Value = str | bool | int | float
 
+#: Classes of ImageNet.
+CLASSES = 1000
+
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
@@ -81,10 +84,17 @@ class Free:
 
 @dataclass(frozen=True, kw_only=True)
 class Loss:
-    """How much two pictures differ: the weighted mean over pixels and channels."""
+    """How much two pictures differ: the weighted mean over pixels and channels. Or what a neural network takes the
+    picture for."""
 
-    norm: Literal["l1", "l2", "relative"] = "l2"
-    """|d|, d², or d² / (t² + 0.01) with the target t."""
+    norm: Literal["l1", "l2", "relative", "classifier"] = "l2"
+    """|d|, d², or d² / (t² + 0.01) with the target t. classifier: the logarithm of the probabilities of `fall` over
+    those of `rise`; nothing is compared, and the target is the scene as its file has it, for people. Needs the extra
+    `adversarial`."""
+    rise: dict[str, int] = dataclasses.field(default_factory=dict)
+    """Classes whose probability shall rise: label -> number, 0 … 999, of ImageNet."""
+    fall: dict[str, int] = dataclasses.field(default_factory=dict)
+    """Classes whose probability shall fall; likewise."""
     pyramid: int = 0
     """Levels of a Gaussian pyramid; the loss is the mean of theirs. 0: only the pictures themselves."""
     exclude_above: float | None = None
@@ -204,6 +214,7 @@ def check(problem: Problem) -> None:
         _positive(f"stage.{i}.", stage, ("rate", "decay"))
     for i, target in enumerate(problem.target):
         _at_least(f"target.{i}.", target, {"sensor": 0, "spp": 1})
+    _check_classifier(problem)
     for i, free in enumerate(problem.free):
         where = f"free.{i}."
         if not free.key:
@@ -216,6 +227,30 @@ def check(problem: Problem) -> None:
                 raise InputError(f'fit: {where}{name} must consist of the letters x, y, z, got "{axes}"')
         if free.lower is not None and free.upper is not None and not free.lower < free.upper:
             raise InputError(f"fit: {where}lower must be below upper, got {free.lower} and {free.upper}")
+
+
+def _check_classifier(problem: Problem) -> None:
+    loss = problem.loss
+    named = [*loss.rise.items(), *loss.fall.items()]
+    if loss.norm != "classifier":
+        if named:
+            raise InputError(f'fit: loss.rise and loss.fall need the norm "classifier", got "{loss.norm}"')
+        return
+    if not named:
+        raise InputError('fit: the norm "classifier" needs loss.rise or loss.fall, such as { "traffic light" = 920 }')
+    for label, number in named:
+        if not 0 <= number < CLASSES:
+            raise InputError(f'fit: the class "{label}" must have a number 0 … {CLASSES - 1}, got {number}')
+    for what, given in (("label", [label for label, _ in named]), ("class", [number for _, number in named])):
+        if twice := {x for x in given if given.count(x) > 1}:
+            raise InputError(f'fit: loss.rise and loss.fall name the {what} "{twice.pop()}" twice')
+    for name in ("pyramid", "exclude_above"):
+        if getattr(loss, name):
+            raise InputError(f'fit: loss.{name} needs pictures that are compared, the norm "classifier" has none')
+    for i, target in enumerate(problem.target):
+        for name in ("file", "mask"):
+            if getattr(target, name) is not None:
+                raise InputError(f'fit: target.{i}.{name}: with the norm "classifier" there is nothing to compare with')
 
 
 def _at_least(where: str, of: Any, minima: dict[str, float]) -> None:

@@ -1,7 +1,8 @@
 """Loss and gradient of one view of a problem, as a pure function of NumPy arrays: what processes and machines share.
 
-The picture is rendered, compared with the target on the host, and the derivative of the loss with respect to its pixels
-weighs a second, independent render, backward. Both are recorded once and replayed (`dr.freeze`) where that is possible.
+The picture is rendered, compared with the target (or shown to a classifier) on the host, and the derivative of the loss
+with respect to its pixels weighs a second, independent render, backward. Both are recorded once and replayed
+(`dr.freeze`) where that is possible.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -18,7 +19,7 @@ import numpy as np
 
 from rimlight.loading import load_integrator, load_scene, use_variant
 
-from . import losses, targets
+from . import classifier, losses, targets
 from .free_parameters import from_flat, to_numpy
 from .problem import Problem
 
@@ -48,11 +49,13 @@ class Task:
 
 @dataclass(frozen=True)
 class Gradient:
-    """loss : at a render. gradients : key -> as `to_numpy` has the value. image : (H, W, C), what was rendered."""
+    """loss : at a render. gradients : key -> as `to_numpy` has the value. image : (H, W, C), what was rendered.
+    scores : label -> probability, with the norm "classifier"."""
 
     loss: float
     gradients: dict[str, np.ndarray]
     image: np.ndarray
+    scores: dict[str, float] = field(default_factory=dict)
 
 
 class Renderer:
@@ -68,6 +71,8 @@ class Renderer:
     def __init__(self, problem: Problem):
         use_variant(problem.variant)
         self.problem = problem
+        if problem.loss.norm == "classifier":
+            classifier.network()  # if it is missing, say so before anything is rendered
         options = dict(problem.integrator)
         kind = options.pop("type")
         define = [f"{key}={value}" for key, value in problem.define.items()]
@@ -95,17 +100,21 @@ class Renderer:
         view = self.views[task.target]
         leaves = view.set(values, task.width)
         image = view.render(task.seed, task.spp)
-        target, weight = view.target_at(image.shape[:2])
-        if target.shape[2] not in (1, image.shape[2]):
-            raise ValueError(
-                f"fit: target.{task.target}: the picture has {target.shape[2]} channels, the film {image.shape[2]}"
-            )
-        loss, by_pixel = losses.value_and_gradient(self.problem.loss, image, target, weight)
+        loss, by_pixel, scores = view.compared(image)
         view.backward(by_pixel, derived_seed(task.seed), task.spp)
         found = {key: dr.grad(leaf) for key, leaf in leaves.items()}
         dr.eval(found)
         gradients = {key: np.array(gradient, np.float32) for key, gradient in found.items()}
-        return Gradient(loss, gradients, image)
+        return Gradient(loss, gradients, image, scores)
+
+    def derivative(self, values: Mapping[str, np.ndarray], change: Mapping[str, np.ndarray], task: Task) -> np.ndarray:
+        """Derivative of a picture as the values change, forward: (H, W, C), float32.
+
+        change : key -> array as in `values`.
+        """
+        view = self.views[task.target]
+        leaves = view.set(values, task.width)
+        return view.forward({key: (leaf, change[key]) for key, leaf in leaves.items()}, task.seed, task.spp)
 
 
 class View:
@@ -146,6 +155,10 @@ class View:
             if self.target.file is None:
                 self._resize(None)
                 image = self._truth()
+                if loss.norm == "classifier" and image.shape[2] != 3:
+                    raise ValueError(
+                        f"fit: target.{self.number}: the classifier wants 3 channels, the film has {image.shape[2]}"
+                    )
                 weight = np.ones(image.shape[:2], np.float32)
             else:
                 image, weight = targets.read(self.target, self.size)
@@ -164,6 +177,18 @@ class View:
     def target_at(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         image, weight = self.picture()
         return targets.smaller(image, weight, size)
+
+    def compared(self, image: np.ndarray) -> tuple[float, np.ndarray, dict[str, float]]:
+        """Loss of a picture, its derivative with respect to each number of it, and the scores of a classifier."""
+        loss = self.renderer.problem.loss
+        if loss.norm == "classifier":
+            return classifier.value_and_gradient(loss, image)
+        target, weight = self.target_at(image.shape[:2])
+        if target.shape[2] not in (1, image.shape[2]):
+            raise ValueError(
+                f"fit: target.{self.number}: the picture has {target.shape[2]} channels, the film {image.shape[2]}"
+            )
+        return *losses.value_and_gradient(loss, image, target, weight), {}
 
     # ---------------------- Scene ----------------------
 
@@ -222,6 +247,18 @@ class View:
         dr.eval(weight)
         with _no_collection():
             derivative(self.scene, self.integrator, weight, dr.opaque(mi.UInt32, seed))
+
+    def forward(self, change: Mapping[str, tuple[mi.Float, np.ndarray]], seed: int, spp: int) -> np.ndarray:
+        """Derivative image. change : key -> what `set` returned, and its derivative."""
+        with _no_collection():
+            image = mi.render(
+                self.scene, self.params, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed
+            )
+            for leaf, derivative in change.values():
+                dr.set_grad(leaf, mi.Float(derivative.astype(np.float32).ravel()))
+            dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in change.values()))
+            dr.traverse(dr.ADMode.Forward)
+            return self._colours(np.array(dr.grad(image)))
 
     def _image(self, seed: Any, spp: int) -> mi.TensorXf:
         with dr.suspend_grad():

@@ -44,11 +44,12 @@ CURVES = 12
 
 COLOURS = ("#3b7dd8", "#d9772b", "#3a9e6b", "#c04f7d", "#8a6fd1", "#a08a2a", "#2fa3b5", "#b0574a")
 
-#: Mean difference that a loss is: name, unit.
+#: What a loss is: name, unit.
 NORMS = {
     "l1": ("mean absolute difference", "radiance"),
     "l2": ("mean squared difference", "radiance²"),
     "relative": ("mean squared relative difference", ""),
+    "classifier": ("log p of what shall fall − of what shall rise", ""),
 }
 
 
@@ -116,6 +117,9 @@ def _verdict(fit: Fit) -> str:
     if len(fit.losses):
         first, last = _loss_before_and_after(fit)
         facts.append(f"loss {number(first)} → {number(last)}")
+    measures = fit.measures[0].items()
+    for label, (before, after) in ((label, pair) for label, pair in measures if label.startswith("probability")):
+        facts.append(f"{label} {number(before)} → {number(after)}")
     for unit, labels in _by_unit(fit.errors).items():
         worst = max(labels, key=lambda label: fit.errors[label][-1])
         before, after = fit.errors[worst][[0, -1]]
@@ -143,9 +147,18 @@ def _warnings(fit: Fit) -> list[str]:
         before, after = measures["root mean square error"]
         if not np.isfinite(after):
             found.append(f"{_name(fit, i)} has pixels that are not finite.")
-        elif after > 1.02 * before:  # not by noise alone
+        elif _compares(fit) and after > 1.02 * before:  # not by noise alone
             found.append(f"{_name(fit, i)} is farther from its target than at the start.")
     return found
+
+
+def _compares(fit: Fit) -> bool:
+    return fit.problem.loss.norm != "classifier"
+
+
+def _goal(fit: Fit) -> str:
+    """What the target shows. What a classifier looks at has none, and is shown beside its beginning."""
+    return "target" if _compares(fit) else "scene as it was"
 
 
 def _loss_before_and_after(fit: Fit) -> tuple[float, float]:
@@ -160,19 +173,22 @@ def _name(fit: Fit, view: int) -> str:
 
 
 def _views(fit: Fit) -> str:
-    sections = ["<section>\n<h2>Result and target</h2>"]
+    goal = _goal(fit)
+    sections = [f"<section>\n<h2>Result and {goal}</h2>"]
     for i, (view, measures) in enumerate(zip(fit.views, fit.measures, strict=True)):
         if len(fit.views) > 1:
             sections.append(f"<h3>View {i}</h3>")
         counts = (view.weight > 0)[..., None]
         panels = [
-            (f"{label} − target", np.where(counts, image - view.target, np.float32(0)))
-            for label, image in (("before", view.start), ("result", view.result))
+            (f"{label} − {goal}", np.where(counts, image - view.target, np.float32(0)))
+            for label, image in (("before", view.start), ("result", view.result))[not _compares(fit) :]
         ]
+        if i == 0 and fit.derivative is not None:
+            panels.append(("derivative on the way from before to result", fit.derivative))
         rows = [(label, number(before, 4), number(after, 4)) for label, (before, after) in measures.items()]
         sections.append(
-            f'<div class="row">\n{page.compare(view.start, view.result, view.target, _name(fit, i))}\n'
-            f'<div class="side">\n{page.table(("", "before", "result"), rows, "Likeness to the target")}\n'
+            f'<div class="row">\n{page.compare(view.start, view.result, view.target, _name(fit, i), goal)}\n'
+            f'<div class="side">\n{page.table(("", "before", "result"), rows, f"Likeness to the {goal}")}\n'
             f"<h3>Differences</h3>\n{page.differences(panels)}\n</div>\n</div>"
         )
     return "\n".join([*sections, "</section>"])
@@ -229,7 +245,7 @@ def _grid(numbers: np.ndarray, per_line: int) -> str:
 
 def _animation(file: Path, fit: Fit) -> str:
     data, last = file.read_bytes(), fit.frames[-1][0]
-    text = f"From step 0 to step {last}, beside the target"
+    text = f"From step 0 to step {last}, beside the {_goal(fit)}"
     if file.suffix == ".mp4":
         uri = page.data_uri(data, "video/mp4")
         shown = f'<video src="{uri}" aria-label="{text}" autoplay loop muted playsinline controls></video>'
@@ -272,6 +288,9 @@ def _curves(fit: Fit) -> str:
         label = f"loss: {name}" + (f" ({unit})" if unit else "")
         note = f"Each step, and the mean of {2 * (WINDOW // 2) + 1} around it."
         plots.append(_plot(fit, {"": fit.losses}, "Loss", label, note))
+    if fit.scores:
+        note = "At the noisy picture of each step."
+        plots.append(_plot(fit, fit.scores, "Classes", "probability", note, linear=True))
     for unit, labels in _by_unit(fit.errors).items():
         shown = sorted(labels, key=lambda label: -fit.errors[label][-1])[:CURVES]
         note = f"The {CURVES} largest at the end, of {len(labels)}." if len(labels) > CURVES else ""
@@ -293,14 +312,16 @@ def _without_unit(label: str) -> str:
     return re.sub(r" \([^()]*\)$", "", label)
 
 
-def _plot(fit: Fit, curves: Mapping[str, np.ndarray], title: str, y: str, note: str) -> str:
+def _plot(fit: Fit, curves: Mapping[str, np.ndarray], title: str, y: str, note: str, *, linear: bool = False) -> str:
     """A figure of HTML. curves : label -> values before each step; of one without a label, the running mean is added.
+    linear : no logarithms, which negative values rule out anyway.
 
     Names are in the legend only, which is HTML: what matplotlib draws is ours.
     """
     figure = Figure(figsize=(5.4, 3.2), layout="constrained")
     axes = figure.add_subplot()
-    logarithmic = any((values > 0).any() for values in curves.values())
+    negative = any((values < 0).any() for values in curves.values())
+    logarithmic = not (linear or negative) and any((values > 0).any() for values in curves.values())
     legend = []
     for i, (label, values) in enumerate(curves.items()):
         if logarithmic:
@@ -388,17 +409,17 @@ MARGIN, TEXT = 8, 26
 
 
 def write_animation(folder: Path, fit: Fit) -> Path:
-    """Write how the first view came near its target: ``convergence.mp4`` if ffmpeg is there, else ``convergence.gif``.
+    """Write how the first view changed: ``convergence.mp4`` if ffmpeg is there, else ``convergence.gif``.
 
     Returns
     -------
-    The file. Its pictures are `fit.frames`, with the target to their right.
+    The file. Its pictures are `fit.frames`, with the target, or the scene as it was, to their right.
 
     Raises
     ------
     OSError : it cannot be written.
     """
-    frames = [_beside_target(step, image, fit.views[0].target) for step, image in fit.frames]
+    frames = [_beside_target(step, image, fit.views[0].target, _goal(fit)) for step, image in fit.frames]
     if program := shutil.which("ffmpeg"):
         try:
             return _write_video(folder / "convergence.mp4", frames, program)
@@ -407,7 +428,7 @@ def write_animation(folder: Path, fit: Fit) -> Path:
     return _write_gif(folder / "convergence.gif", frames)
 
 
-def _beside_target(step: int, image: np.ndarray, target: np.ndarray) -> Image.Image:
+def _beside_target(step: int, image: np.ndarray, target: np.ndarray, goal: str) -> Image.Image:
     image = page.shrunk(image, LARGEST, LARGEST)
     height, width = image.shape[:2]
     factor = max(ENLARGED // max(height, width), 1)
@@ -418,7 +439,7 @@ def _beside_target(step: int, image: np.ndarray, target: np.ndarray) -> Image.Im
     draw = ImageDraw.Draw(canvas)
     font = ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), 13)
     for i, (shown, label) in enumerate(
-        ((image, f"step {step}"), (resample(np.nan_to_num(target), (height, width)), "target"))
+        ((image, f"step {step}"), (resample(np.nan_to_num(target), (height, width)), goal))
     ):
         left = MARGIN + i * (panel + MARGIN)
         pixels = Image.fromarray(pictures.to_srgb(shown)).resize(size, Image.Resampling.NEAREST)

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from rimlight.inverse import free_parameters, losses, renderer
+from rimlight.inverse.fitting import Run
 from rimlight.inverse.optimisers import inner_product
 from rimlight.inverse.problem import Free, Loss, Problem, Target
 from rimlight.inverse.renderer import Renderer, Task
@@ -117,6 +118,27 @@ def test_gradient_is_that_of_the_loss(room, view, key, kind, start, latent, dire
     error = np.hypot(g_error, f_error)
     assert abs(g - f) <= 4 * error
     assert error < 0.05 * abs(f), "too noisy to mean something"
+
+
+def test_derivative_image_is_that_on_the_way(room):
+    """From the start through the result, of a rigid body, a camera and a colour at once."""
+    free = (
+        Free(key=(BOX,), kind="pose", start=(0.2, 0, 0, 0, 20, 0)),
+        Free(key=("left.to_world",), kind="pose", start=(0.1, 0.1, 0, 0, 0, 0)),
+        Free(key=(FLOOR,), kind="material", start=(0.3, 0.4, 0.5)),
+    )
+    run = Run(problem(room, *free, target=(Target(spp=16),)))
+    result, step = {name: truth for p in run.parameters for name, truth in p.truth.items()}, 0.05
+
+    def image(t: float, seed: int) -> np.ndarray:
+        at = {name: x + np.float32(t) * (x - run.start[name]) for name, x in result.items()}
+        return run.renderer.image(run._values(at), Task(0, None, 4096, seed)).astype(np.float64)
+
+    seeds, at = range(4), run._values(result)
+    found = np.mean([run.renderer.derivative(at, run._way(result), Task(0, None, 1024, seed)) for seed in seeds], 0)
+    expected = np.mean([image(step, 9 + seed) - image(-step, 9 + seed) for seed in seeds], 0) / (2 * step)
+    print(np.abs(found - expected).sum() / np.abs(expected).sum())
+    assert np.abs(found - expected).sum() < 0.04 * np.abs(expected).sum()
 
 
 # ------------------------------------------------------------------ random numbers

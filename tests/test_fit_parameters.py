@@ -98,7 +98,7 @@ def walk(parameter, steps: int = 8, slope: float | None = None, **options) -> di
     rng = np.random.default_rng(0)
     for _ in range(steps):
         attached = optimiser.values()
-        sizes = {key: free_parameters.to_numpy(value).size for key, value in attached[0].items()}
+        sizes = {key: free_parameters.to_numpy(value).size for key, value in attached.items()}
         along = lambda size: rng.standard_normal(size) if slope is None else np.full(size, slope)
         optimiser.step(attached, {key: along(size).astype(np.float32) for key, size in sizes.items()}, 1)
     return optimiser.latents()
@@ -215,6 +215,38 @@ def test_directions_stay_of_unit_length(params):
         np.testing.assert_allclose(lengths, 1, atol=1e-6)
 
 
+def test_vertices_that_also_move_as_a_body(params):
+    """The body moves what the vertices have become. Gradients against differences of the motion, written anew."""
+    entries = [Free(key=(BOX,), kind="shape"), Free(key=(BOX,), kind="pose", start=(0.1, -0.2, 0.3, 10, -50, 130))]
+    box, body = free_parameters.find(entries, params)
+    assert (box.name, body.name) == ("box", "box (whole)")
+    rng = np.random.default_rng(0)
+    latents = {
+        name: np.float32(x + 0.1 * rng.standard_normal(x.size)) for p in (box, body) for name, x in p.start.items()
+    }
+    weights = rng.standard_normal(points(params).shape)
+    weld, centre = np.array(box.weld), points(params).mean(0)
+
+    def place(at) -> np.ndarray:
+        R = Rotation.from_rotvec(at["box (whole).turn"]).as_matrix()
+        return (at[BOX].reshape(-1, 3)[weld] - centre) @ R.T + centre + at["box (whole).move"]
+
+    held = {name: mi.Float(latent) for name, latent in latents.items()}
+    dr.enable_grad(held)
+    moved = free_parameters.values([box, body], held)
+    assert list(moved) == [BOX]
+    np.testing.assert_allclose(np.array(moved[BOX]).reshape(-1, 3), place(latents), atol=1e-5)
+    dr.backward(dr.sum(moved[BOX] * mi.Float(weights.astype(np.float32).ravel())))
+    h = 1e-5
+    for name, latent in latents.items():
+        change = lambda i, name=name, latent=latent: (
+            latents | {name: latent.astype(np.float64) + h * np.eye(latent.size)[i]}
+        )
+        at_rest = latents | {name: latent.astype(np.float64)}
+        expected = [np.sum(weights * (place(change(i)) - place(at_rest))) / h for i in range(latent.size)]
+        np.testing.assert_allclose(np.array(dr.grad(held[name])), expected, rtol=1e-3, atol=1e-3)
+
+
 def test_starts_of_every_kind(params):
     shift = np.array([0.5, -1, 2])
     for start, expected in ((shift, shift), (np.tile(shift, 24), shift)):
@@ -271,6 +303,10 @@ def test_errors_are_distances_from_the_truth(params):
         ([{"key": ("box.faces",)}], ['"box.faces"', "UInt"]),
         ([{"key": (BOX, BOX)}], [BOX, "free twice"]),
         ([{"key": (BOX,)}, {"key": (FLOOR, BOX)}], [BOX, "free twice"]),
+        ([{"key": (BOX,), "kind": "pose"}, {"key": (BOX,)}], [BOX, "free twice"]),
+        ([{"key": (BOX,), "kind": "pose"}] * 2, [BOX, "free twice"]),
+        ([{"key": (BOX,)}, {"key": (BOX,), "kind": "pose"}, {"key": (BOX,), "kind": "pose"}], [BOX, "free twice"]),
+        ([{"key": (BOX,)}, {"key": (BOX, BOX), "kind": "pose"}], [BOX, "free twice"]),
         ([{"key": (BOX,), "start": (1, 2)}], ['"box"', "3 or 72 numbers, got 2"]),
         ([{"key": (BOX,), "kind": "pose", "start": (1, 2, 3)}], ['"box"', "6 numbers, got 3"]),
         ([{"key": (FLOOR,), "start": (0.1, 0.2)}], [FLOOR, "1 or 3 numbers, got 2"]),

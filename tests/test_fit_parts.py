@@ -48,6 +48,11 @@ RICH = Problem(
     variant="cuda_ad_rgb",
     threads=3,
 )
+ADVERSARIAL = Problem(
+    scene=Path("a.xml"),
+    free=RICH.free,
+    loss=Loss(norm="classifier", rise={"traffic light": 920}, fall={'"ä"': 0, "b.c": 999}),
+)
 HEAD = 'scene = "a.xml"\n'
 FREE = '[[free]]\nkey = "a"\nkind = "shape"\n'
 
@@ -62,10 +67,11 @@ def set_fields(values) -> dict[str, list]:
 
 
 def test_problems_survive_toml(tmp_path, monkeypatch):
-    for of_a_kind in ([RICH], RICH.target, RICH.free, [RICH.loss], RICH.stage, [RICH.starts]):
+    for of_a_kind in ([RICH], RICH.target, RICH.free, [RICH.loss, ADVERSARIAL.loss], RICH.stage, [RICH.starts]):
         assert all(set_fields(of_a_kind).values()), "the example leaves a field at its default"
     again = problem.from_text(problem.text(RICH))
     assert again == RICH
+    assert problem.from_text(problem.text(ADVERSARIAL)) == ADVERSARIAL
     assert [type(v) for v in again.integrator.values()] == [str, int, bool, float, bool]
     monkeypatch.chdir(tmp_path)
     problem.write(Path("fit.toml"), RICH)

@@ -47,7 +47,7 @@ def test_room_has_177_parameters(tmp_path):
     found = free_parameters.find(problem.free, mi.traverse(scene))
     assert sum(latent.size for p in found for latent in p.start.values()) == 177
     assert [len(f.key) for f in problem.free] == [1, 42, 13, 2]
-    assert [stage.resolution for stage in problem.stage] == [64 * k for k in range(1, 9)]
+    assert [stage.resolution for stage in problem.stage] == [64, 128, 256]
     image = np.array(mi.render(scene, spp=16, integrator=mi.load_dict({"type": "path", "max_depth": 4})))
     assert np.isfinite(image).all() and image.mean() > 0.05
 
@@ -77,11 +77,20 @@ def test_what_holds(found, holds):
     assert found.holds == holds
 
 
+@pytest.mark.parametrize(("rise", "fall", "holds"), [(0.5, 0.1, True), (0.1, 0.5, False)])
+def test_what_an_adversarial_scene_must_reach(rise, fall, holds):
+    found = dataclasses.replace(outcome("fig10", 0, 1), rise=rise, fall=fall)
+    assert found.holds == holds
+    (row,) = reproduce.table([found])[2:]
+    assert f"{rise} : {fall}" in row and f"{int(holds)} of 1" in row and "%" not in row
+
+
 def test_summary(tmp_path):
     outcomes = [outcome("fig6a", 0.009, 9), outcome("fig6a", 0.02, 1.6), outcome("fig6b", 0.001, 1)]
+    outcomes.append(dataclasses.replace(outcome("fig10", 0, 1), losses=[2.0, -3.0]))
     reproduce.write_summary(tmp_path, outcomes)
     lines = (tmp_path / "summary.md").read_text("utf-8").splitlines()
-    assert len(lines) == 4
+    assert len(lines) == 5
     assert "| 1 of 2 |" in lines[2] and "| 1 of 1 |" in lines[3]
     assert len({line.count("|") for line in lines}) == 1
     assert (tmp_path / "convergence.png").stat().st_size > 5000

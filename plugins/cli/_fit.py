@@ -111,9 +111,9 @@ def command(argv: Sequence[str]) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
-    """Run the fits of Li et al. 2018 (figures 1 and 6), with a report of each and a table of all."""
+    """Run the fits of Li et al. 2018 (figures 1, 6 and 10), with a report of each and a table of all."""
 
-    figure: Positional[Literal["fig1", "fig6a", "fig6b", "fig6c", "fig6d", "fig6e", "fig6f", "fig6", "all"]]
+    figure: Positional[Literal["fig1", "fig6a", "fig6b", "fig6c", "fig6d", "fig6e", "fig6f", "fig6", "fig10", "all"]]
     """Which."""
     out: Path
     """Folder for the reports. What is there already is not made again."""
