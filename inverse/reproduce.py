@@ -259,7 +259,10 @@ def write_convergence(path: Path, outcomes: Sequence[Outcome]) -> None:
         for o in (o for o in outcomes if o.name == name and o.times):
             colour = "C0" if o.method == "ours" else "C1"
             draw = axes.loglog if min(o.losses) > 0 else axes.semilogx
-            draw(o.times, _smooth(o.losses), colour, linewidth=1, alpha=0.7)
+            # A fit of few steps would be no line.
+            draw(o.times, _smooth(o.losses), colour, linewidth=1, alpha=0.7, marker="." if len(o.times) < 10 else "")
+        if any(o.name == name and not o.times for o in outcomes):
+            axes.text(0.97, 0.93, f"{PEER} raises", color="C1", ha="right", va="top", transform=axes.transAxes)
         axes.set(title=name, xlabel="seconds", ylabel="loss")
         axes.grid(alpha=0.3)
     methods = dict.fromkeys(o.method for o in outcomes)

@@ -117,7 +117,7 @@ def test_page_needs_nothing_but_itself(folder):
 def test_images_are_whole_and_not_blank(folder, fit):
     images = Page((folder / "report.html").read_text("utf-8")).images()
     pixels = [np.asarray(image.convert("RGB")) for image in images]
-    assert len(pixels) == 5 + (folder / "convergence.gif").exists()
+    assert len(pixels) == 6 + (folder / "convergence.gif").exists()
     assert all(np.ptp(a) > 0 for a in pixels)
     expected = [report.pictures.to_srgb(image) for image in (fit.views[0].target, fit.views[0].result)]
     np.testing.assert_array_equal(pixels[0], expected[0])

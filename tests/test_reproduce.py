@@ -111,3 +111,20 @@ def test_interrupted_runs_go_on(tmp_path, monkeypatch):
     (found,) = reproduce.reproduce("fig6a", tmp_path, seeds=range(1))
     assert not calls and found.holds
     assert set(EXPERIMENTS) >= {"fig1", "fig6a"}
+
+
+def test_a_peer_that_raises_is_shown(tmp_path, monkeypatch):
+    def raises(*_, **__):
+        raise RuntimeError("not attached") from Exception("no camera")
+
+    monkeypatch.setattr(reproduce, "fit", raises)
+    folder = tmp_path / "fig6a" / "ours_0"
+    folder.mkdir(parents=True)
+    (folder / "outcome.json").write_text(json.dumps(dataclasses.asdict(outcome("fig6a", 0.001, 1))))
+    for _ in range(2):  # the second time from its file
+        ours, peer = reproduce.reproduce("fig6a", tmp_path, seeds=range(1), peer=True)
+    assert ours.holds and not peer.holds and peer.status == "cannot: no camera"
+    rows = (tmp_path / "summary.md").read_text("utf-8").splitlines()
+    assert "| prb_projective | cannot |" in rows[3] and "0 of 1" in rows[3]
+    with pytest.raises(RuntimeError, match="not attached"):
+        reproduce.reproduce("fig6b", tmp_path, seeds=range(1))
