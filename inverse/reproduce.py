@@ -158,6 +158,7 @@ def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None
             raise KeyboardInterrupt
         report.write(folder, found, title=f"{EXPERIMENTS[name]} ({name}, {method}, seed {seed})")
         outcome = _judge(name, seed, method, found)
+    folder.mkdir(parents=True, exist_ok=True)
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(dataclasses.asdict(outcome)), "utf-8")
     # Dr.Jit 1.5 aborts ("invalid redefinition of function") with the kernels of many scenes.
