@@ -196,6 +196,10 @@ class Values(Parameter):
         start = _numbers(free.start, counts, name, f"1 or {len(truth)} numbers") if free.start else truth
         self.truth = {key: truth}
         self.start = {key: np.resize(start, len(truth)).astype(np.float32)}
+        if free.unit_length and (truth.size % 3 or not np.linalg.norm(self.start[key].reshape(-1, 3), axis=1).all()):
+            raise ValueError(
+                f'fit: "{key}" has no rows of three numbers, or one of length 0: it cannot have unit_length'
+            )
         if not np.array_equal(self.legal(key, self.start[key]), self.start[key]) and not free.unit_length:
             raise ValueError(
                 f'fit: "{key}" starts outside of its legal range {self.low} … {self.high}; '

@@ -196,8 +196,9 @@ def check(problem: Problem) -> None:
         raise InputError("fit: nothing is free, add a table [[free]]")
     if not problem.target or not problem.stage:
         raise InputError("fit: a fit needs at least one target and one stage")
-    at_least = {"parts": 1, "seed": 0, "threads": 1, "max_bad": 1, "patience": 1, "seconds": 0, "clip": 0}
+    at_least = {"parts": 1, "seed": 0, "threads": 1, "max_bad": 1, "patience": 1, "seconds": 0}
     _at_least("", problem, at_least)
+    _positive("", problem, ("clip",))
     for name in ("momentum", "smooth_scale"):
         if not 0 <= getattr(problem, name) < 1:
             raise InputError(f"fit: {name} must be in [0, 1), got {getattr(problem, name)}")
@@ -225,8 +226,12 @@ def check(problem: Problem) -> None:
             axes = getattr(free, name)
             if set(axes) - set("xyz") or len(set(axes)) < len(axes):
                 raise InputError(f'fit: {where}{name} must consist of the letters x, y, z, got "{axes}"')
-        if free.lower is not None and free.upper is not None and not free.lower < free.upper:
-            raise InputError(f"fit: {where}lower must be below upper, got {free.lower} and {free.upper}")
+        low, high = (
+            default if bound is None else bound
+            for bound, default in ((free.lower, float("-inf")), (free.upper, float("inf")))
+        )
+        if not low < high:  # nor if one is not a number
+            raise InputError(f"fit: {where}lower must be below upper, got {low} and {high}")
 
 
 def _check_classifier(problem: Problem) -> None:

@@ -213,6 +213,8 @@ def test_directions_stay_of_unit_length(params):
     for latents in (normals.start, walk(normals), normals.scatter(np.random.default_rng(0), 0, 0, 1)):
         lengths = np.linalg.norm(values(normals, latents)[key].reshape(-1, 3), axis=1)
         np.testing.assert_allclose(lengths, 1, atol=1e-6)
+    with pytest.raises(ValueError, match="length 0"):
+        found(params, key, unit_length=True, start=(0.0,))
 
 
 def test_vertices_that_also_move_as_a_body(params):

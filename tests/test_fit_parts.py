@@ -135,6 +135,8 @@ def test_numbers_of_scene_files_need_no_quotes():
         (HEAD + FREE + 'move = "xw"\n', ["free.0.move", "xw"]),
         (HEAD + FREE + 'turn = "xx"\n', ["free.0.turn", "xx"]),
         (HEAD + FREE + "lower = 2\nupper = 1\n", ["free.0.lower", "2", "1"]),
+        (HEAD + FREE + "lower = nan\n", ["free.0.lower", "nan"]),
+        (HEAD + "clip = 0\n" + FREE, ["clip must be > 0, got 0"]),
     ],
 )
 def test_mistakes_are_named_in_one_line(tmp_path, text, culprits):
