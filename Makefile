@@ -24,8 +24,8 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
 
-# All of them take about half an hour; or one: make bench NAME=scaling
-NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illumination scaling rig
+# All of them take about three quarters of an hour; or one: make bench NAME=scaling
+NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illumination scaling rig integration reflectance photometric_stereo single_image
 bench: setup
 	for name in $(NAME); do $(BIN)/python tests/benchmarks/bm_$$name.py || exit 1; done
 

@@ -1,22 +1,26 @@
-"""Make the pictures of the README and the documentation:  python docs/make_images.py
+"""Make the pictures of the README and the documentation:  python docs/make_images.py [FOLDER]
 
-About seven minutes on two cores. Writes docs/images/overview.png, and adversarial.png, which needs the extra
-`adversarial`.
+About seven minutes on two cores. Writes docs/images/overview.png; normal_integration.png, which needs the depth of the
+bear of DiLiGenT in ../shared; adversarial.png, which needs the extra `adversarial`; and reflectance.png, if the
+argument names a folder with tables of the MERL database.
 """
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
 from pathlib import Path
 
 # isort: off
 import rimlight  # noqa: F401  (first: it chooses the LLVM library)
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 # isort: on
 
 IMAGES = Path(__file__).parent / "images"
+BEAR = Path(__file__).parents[2] / "shared" / "data" / "diligent" / "bear_depth"
 RES = 160
 
 #: Samples per pixel of a launch, and launches, of the derivative images.
@@ -63,6 +67,65 @@ def overview(path: Path) -> None:
     )
 
 
+def normal_integration(path: Path) -> None:
+    """Depth of the bear from its true normals, and its errors without and with bilateral weights."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from rimlight.inverse.photometric_stereo.integration import depth_error, integrate
+
+    read = lambda name: np.array(mi.Bitmap(str(BEAR / name)))
+    mask = read("mask.png").reshape(512, 612, -1)[..., 0] > 0
+    rows, columns = (slice(i.min() - 4, i.max() + 5) for i in np.nonzero(mask))
+    normals = read("normal_map.png")[..., :3] / 65535.0 * 2 - 1
+    truth, camera = np.load(BEAR / "depth_gt.npz")["depth_gt"], np.loadtxt(BEAR / "K.txt")
+    truth = np.where(mask, truth, np.nan)
+    figure = Figure(figsize=(11, 4.2), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 3)
+    axes[0].set_title("true depth, mm", fontsize=9)
+    shown = [axes[0].imshow(truth[rows, columns], cmap="viridis_r")]
+    for ax, title, options in (
+        (axes[1], "continuous surface", {}),
+        (axes[2], "bilateral weights", {"bilateral": 2}),
+    ):
+        depth = integrate(normals, mask, camera=camera, **options)
+        depth *= np.median((truth / depth)[mask])
+        error = depth_error(depth, truth, mask, align="scale")
+        ax.set_title(f"{title}: error, mm (mean {error:.2f})", fontsize=9)
+        shown.append(ax.imshow((depth - truth)[rows, columns], cmap="RdBu_r", vmin=-5, vmax=5))
+    for ax, image in zip(axes, shown, strict=True):
+        ax.set_axis_off()
+        figure.colorbar(image, ax=ax, shrink=0.8)
+    figure.savefig(path)
+
+
+def reflectance(path: Path, folder: Path) -> None:
+    """Slices through two tables, and through the weights of the package for these materials."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 6), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    degrees = np.linspace(-89, 89, 1001)
+    direction = lambda angle: mi.Vector3f(np.sin(np.radians(angle)), 0, np.cos(np.radians(angle)))
+    for row, name in zip(figure.subplots(2, 3, sharex=True), ("gray-plastic", "dark-blue-paint"), strict=True):
+        measured = mi.load_dict({"type": "merl", "filename": str(folder / f"{name}.binary")})
+        fitted = mi.load_dict({"type": "ggx_dictionary", "material": name})
+        for ax, angle in zip(row, (0, 30, 70), strict=True):
+            si, wo = dr.zeros(mi.SurfaceInteraction3f, len(degrees)), direction(degrees)
+            si.wi = direction(np.full_like(degrees, -angle))
+            for bsdf, style in ((measured, "-"), (fitted, "--")):
+                values = np.array(bsdf.eval(mi.BSDFContext(), si, wo) / wo.z)
+                for value, colour in zip(values, ("tab:red", "tab:green", "tab:blue"), strict=True):
+                    ax.semilogy(degrees, value, style, color=colour, linewidth=1)
+            ax.set_title(f"{name}, light from {-angle}°", fontsize=9)
+            ax.grid(alpha=0.3)
+        row[0].set_ylabel("reflectance, 1/sr")
+    figure.supxlabel("viewing angle in the plane of incidence, degrees; solid: table, dashed: fit", fontsize=9)
+    figure.savefig(path)
+
+
 def adversarial(path: Path) -> None:
     """The stop sign before and after the fit of figure 10, and what the network says in each step."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -95,4 +158,7 @@ if __name__ == "__main__":
     mi.set_log_level(mi.LogLevel.Error)
     IMAGES.mkdir(exist_ok=True)
     overview(IMAGES / "overview.png")
+    normal_integration(IMAGES / "normal_integration.png")
     adversarial(IMAGES / "adversarial.png")
+    if len(sys.argv) > 1:
+        reflectance(IMAGES / "reflectance.png", Path(sys.argv[1]))

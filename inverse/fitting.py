@@ -201,7 +201,8 @@ class Run:
             dr.set_thread_count(problem.threads)
         self.renderer = Renderer(problem)
         for view in self.renderer.views:
-            view.picture()
+            for width in {stage.resolution for stage in problem.stage}:
+                view.target_at(view.size_at(width))  # what is wrong with a picture is said at once
         self.parameters = free_parameters.find(problem.free, self.renderer.params)
         compares = problem.loss.norm != "classifier"
         self.truth_is_known = compares and all(target.file is None for target in problem.target)
@@ -370,7 +371,7 @@ class Run:
     def _recent(self) -> tuple[float, float]:
         """Mean of the last losses of the segment that are finite, and its standard error."""
         now = self.progress
-        recent = [x for x, k in zip(now.losses, now.segments, strict=True) if k == now.segment][-WINDOW:]
+        recent = [x for x, k in zip(now.losses[-WINDOW:], now.segments[-WINDOW:], strict=True) if k == now.segment]
         recent = [x for x in recent if np.isfinite(x)]
         if not recent:
             return float("inf"), 0.0

@@ -6,11 +6,15 @@ import base64
 import html
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 
 import matplotlib
 import matplotlib.image
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
 
 from rimlight import pictures
 
@@ -249,3 +253,34 @@ def differences(panels: Sequence[tuple[str, np.ndarray]]) -> str:
         f'<div class="scale" style="background: linear-gradient(to right, {stops})"></div>\n'
         f'<div class="ends"><span>{number(-limit, 2)}</span><span>radiance</span><span>+{number(limit, 2)}</span></div>'
     )
+
+
+# ------------------------------------------------------------------ plots
+
+#: Of curves.
+COLOURS = ("#3b7dd8", "#d9772b", "#3a9e6b", "#c04f7d", "#8a6fd1", "#a08a2a", "#2fa3b5", "#b0574a")
+
+#: Stands for the colour of the text around a plot, which CSS knows.
+INK = "#010203"
+
+
+def paint(axes: Axes) -> None:
+    """Grid and axes in the colour of the text."""
+    axes.grid(alpha=0.25, color=INK, linewidth=0.5)
+    axes.set_facecolor("none")
+    axes.tick_params(which="both", colors=INK, labelsize=8)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set(color=INK, fontsize=8.5)
+    for side, spine in axes.spines.items():
+        spine.set(color=INK, linewidth=0.6, visible=side in ("left", "bottom"))
+
+
+def svg(figure: Figure, text: str) -> str:
+    """A figure as SVG that may stand in a page beside others, in the colour of its text. text : what it shows."""
+    figure.patch.set_alpha(0)
+    file = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": text}):
+        FigureCanvasSVG(figure).print_svg(file, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+    drawing = re.sub(r'<g id="[^"]*">', "<g>", file.getvalue().partition("<svg")[2])
+    drawing = re.sub(r'^[^>]*?viewBox="([^"]*)"[^>]*>', r' viewBox="\1">', drawing).replace(INK, "currentColor")
+    return f'<svg role="img" aria-label="{html.escape(text)}"{drawing.strip()}'

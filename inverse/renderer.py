@@ -175,8 +175,13 @@ class View:
         return self._colours(total / passes)
 
     def target_at(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        image, weight = self.picture()
-        return targets.smaller(image, weight, size)
+        image, weight = targets.smaller(*self.picture(), size)
+        if not weight.any():
+            raise ValueError(
+                f"fit: target.{self.number}: no pixel counts at {size[1]} x {size[0]}, each holds something that mask, "
+                "alpha or exclude_above leave out; use a larger resolution"
+            )
+        return image, weight
 
     def compared(self, image: np.ndarray) -> tuple[float, np.ndarray, dict[str, float]]:
         """Loss of a picture, its derivative with respect to each number of it, and the scores of a classifier."""
@@ -223,8 +228,12 @@ class View:
         self.params.update()
         return leaves
 
+    def size_at(self, width: int | None) -> tuple[int, int]:
+        """Height and width of the film."""
+        return self.size if width is None else (max(round(self.size[0] * width / self.size[1]), 1), width)
+
     def _resize(self, width: int | None) -> None:
-        size = self.size if width is None else (max(round(self.size[0] * width / self.size[1]), 1), width)
+        size = self.size_at(width)
         if size != tuple(reversed(self.sensor.film().crop_size())):
             self.film["film.size"] = mi.ScalarVector2u(size[1], size[0])
             self.film.update()

@@ -19,7 +19,6 @@ import matplotlib
 import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
@@ -41,8 +40,6 @@ FEW = 16
 
 #: Curves of one plot.
 CURVES = 12
-
-COLOURS = ("#3b7dd8", "#d9772b", "#3a9e6b", "#c04f7d", "#8a6fd1", "#a08a2a", "#2fa3b5", "#b0574a")
 
 #: What a loss is: name, unit.
 NORMS = {
@@ -276,9 +273,6 @@ def _settings(fit: Fit) -> str:
 
 # ------------------------------------------------------------------ curves
 
-#: Stands for the colour of the text around a plot, which CSS knows.
-INK = "#010203"
-
 
 def _curves(fit: Fit) -> str:
     """Loss and errors over the steps. Errors of different units are in different plots."""
@@ -326,7 +320,7 @@ def _plot(fit: Fit, curves: Mapping[str, np.ndarray], title: str, y: str, note: 
     for i, (label, values) in enumerate(curves.items()):
         if logarithmic:
             values = np.where(np.isfinite(values) & (values > 0), values, np.nan)
-        colour, dashes = COLOURS[i % len(COLOURS)], ("", "5 2")[i // len(COLOURS) % 2]
+        colour, dashes = page.COLOURS[i % len(page.COLOURS)], ("", "5 2")[i // len(page.COLOURS) % 2]
         style = (0, tuple(map(float, dashes.split()))) if dashes else "-"
         if label:
             axes.plot(values, color=colour, linestyle=style, linewidth=1.4)
@@ -340,10 +334,10 @@ def _plot(fit: Fit, curves: Mapping[str, np.ndarray], title: str, y: str, note: 
     axes.set(xlabel="step", ylabel=y)
     axes.margins(x=0.02)
     _mark_segments(axes, fit)
-    _paint(axes)
+    page.paint(axes)
     items = f'<ul class="legend">\n{"".join(legend)}\n</ul>' if legend else ""
     caption = f"<figcaption>{html.escape(note)}</figcaption>" if note else ""
-    return f"<figure>\n<h3>{title}</h3>\n{_svg(figure, f'{title}: {y}')}\n{items}{caption}</figure>\n"
+    return f"<figure>\n<h3>{title}</h3>\n{page.svg(figure, f'{title}: {y}')}\n{items}{caption}</figure>\n"
 
 
 def _running_mean(values: np.ndarray, segments: np.ndarray) -> np.ndarray:
@@ -365,32 +359,11 @@ def _mark_segments(axes: Axes, fit: Fit) -> None:
     for step in begins if len(begins) > 1 else []:
         segment = int(fit.segments[step])
         if step:
-            axes.axvline(step, color=INK, linewidth=0.6, alpha=0.6)
+            axes.axvline(step, color=page.INK, linewidth=0.6, alpha=0.6)
         if len(begins) <= 6:
             explored = starts > 1 and segment < starts
             label = f"start {segment + 1}" if explored else f"stage {segment + 2 - starts}"
-            axes.text(step, 1.01, label, transform=axes.get_xaxis_transform(), fontsize=7.5, color=INK)
-
-
-def _paint(axes: Axes) -> None:
-    axes.grid(alpha=0.25, color=INK, linewidth=0.5)
-    axes.set_facecolor("none")
-    axes.tick_params(which="both", colors=INK, labelsize=8)
-    for label in (axes.xaxis.label, axes.yaxis.label):
-        label.set(color=INK, fontsize=8.5)
-    for side, spine in axes.spines.items():
-        spine.set(color=INK, linewidth=0.6, visible=side in ("left", "bottom"))
-
-
-def _svg(figure: Figure, text: str) -> str:
-    """A figure as SVG that may stand in a page beside others, in the colour of its text."""
-    figure.patch.set_alpha(0)
-    file = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": text}):
-        FigureCanvasSVG(figure).print_svg(file, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
-    drawing = re.sub(r'<g id="[^"]*">', "<g>", file.getvalue().partition("<svg")[2])
-    drawing = re.sub(r'^[^>]*?viewBox="([^"]*)"[^>]*>', r' viewBox="\1">', drawing).replace(INK, "currentColor")
-    return f'<svg role="img" aria-label="{html.escape(text)}"{drawing.strip()}'
+            axes.text(step, 1.01, label, transform=axes.get_xaxis_transform(), fontsize=7.5, color=page.INK)
 
 
 # ------------------------------------------------------------------ animation

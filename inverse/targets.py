@@ -6,7 +6,6 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from scipy.interpolate import interp1d
 from skimage.transform import resize
 
 from rimlight.edge_sampling.exr import read_exr
@@ -115,11 +114,16 @@ def smaller(image: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tup
 def resample(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A picture of another size, (H, W, ...): means over the new pixels, as a box filter makes them; between pixels of
     a picture that is too small, linear."""
+    if image.shape[:2] == size:
+        return image
     if any(new > old for new, old in zip(size, image.shape, strict=False)):
         return resize(image, size, order=1, preserve_range=True).astype(np.float32)
-    for axis, new in enumerate(size):
-        old = image.shape[axis]
-        integral = np.insert(np.cumsum(image, axis, np.float64), 0, 0, axis)
-        at_borders = interp1d(np.arange(old + 1), integral, axis=axis)(np.linspace(0, old, new + 1))
-        image = np.diff(at_borders, axis=axis) * (new / old)
-    return image.astype(np.float32)
+    down, across = (_shares(old, new) for old, new in zip(image.shape, size, strict=False))
+    return np.einsum("ih,hw...,jw->ij...", down, image, across, optimize=True).astype(np.float32)
+
+
+def _shares(old: int, new: int) -> np.ndarray:
+    """Of each new pixel, what part lies in each old one, in one dimension: (new, old), rows add up to 1."""
+    borders, i = np.linspace(0, old, new + 1)[:, None], np.arange(old)
+    overlap = np.minimum(borders[1:], i + 1) - np.maximum(borders[:-1], i)
+    return np.maximum(overlap, 0) * (new / old)

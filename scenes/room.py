@@ -128,7 +128,7 @@ LIGHTS = {
 }
 
 #: Resolution, steps, factor of the rates at the begin, and at the end of that.
-STAGES = ((64, 150, 1.0, 0.4), (128, 150, 0.4, 0.25), (256, 100, 0.1, 0.1))
+STAGES = ((64, 150, 1.0, 0.4), (128, 150, 0.4, 0.25), (256, 300, 0.1, 0.03))
 
 HEAD = """<!-- Made by rimlight.scenes.room -->
 <scene version="3.0.0">
@@ -180,7 +180,8 @@ def fit() -> str:
             "# Made by rimlight.scenes.room",
             'scene = "room.xml"',
             'define = { res = "256" }',
-            'integrator = { type = "prb_edge", max_depth = 5 }\n',
+            'integrator = { type = "prb_edge", max_depth = 5 }',
+            "clip = 1.5\n",
             "[[target]]\nspp = 512\n",
             '[[free]]\nkey = "camera.to_world"\nkind = "pose"\nrate = 0.02\nturn_rate = 0.01',
             "start = [0.15, -0.1, 0.12, 4, -5, 3]\n",

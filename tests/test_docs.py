@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
+from rimlight import merl_tables
 from rimlight._registration import plugin_modules
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -84,8 +86,16 @@ def test_snippets_run(page, tmp_path):
     assert result.returncode == 0, result.stderr[-3000:]
 
 
+@pytest.fixture(scope="module")
+def example_files(variant, tmp_path_factory) -> None:
+    """Files that the pages name, in a folder that Mitsuba searches."""
+    folder = tmp_path_factory.mktemp("examples")
+    merl_tables.write_merl(folder / "gray-plastic.binary", np.full(merl_tables.SHAPE, 0.1))
+    mi.file_resolver().prepend(str(folder))
+
+
 @pytest.mark.parametrize("name", [p.stem for p in sorted((ROOT / "docs" / "plugins").glob("*.rst"))])
-def test_tabs_of_manual_pages_load(name):
+def test_tabs_of_manual_pages_load(example_files, name):
     """The XML and the Python of a plugin's page make objects of the same type."""
     (module,) = (m for k, m in plugin_modules(mi.variant()).items() if k.rpartition(".")[2] == name)
     (page,) = (text for c in vars(module).values() if inspect.isclass(c) and "code-tab::" in (text := c.__doc__ or ""))

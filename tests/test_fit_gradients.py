@@ -14,7 +14,7 @@ from PIL import Image
 from rimlight.inverse import free_parameters, losses, renderer
 from rimlight.inverse.fitting import Run
 from rimlight.inverse.optimisers import inner_product
-from rimlight.inverse.problem import Free, Loss, Problem, Target
+from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
 from rimlight.inverse.renderer import Renderer, Task
 
 ROOM = """<scene version="3.0.0">
@@ -297,6 +297,18 @@ def test_a_film_without_colours_does_not_show_them(room, tmp_path):
     tested = Renderer(problem(room, define={"format": "luminance"}, target=(Target(file=file),)))
     with pytest.raises(ValueError, match=r"target\.0: the picture has 3 channels, the film 1"):
         tested.gradient({}, Task(0, None, 1, 0))
+
+
+def test_a_resolution_at_which_no_pixel_counts_is_refused_at_once(room, tmp_path):
+    """Else loss and gradient would be 0."""
+    stripes = np.full((24, 24), 255, np.uint8)
+    stripes[:, ::4] = 0
+    Image.fromarray(stripes).save(tmp_path / "mask.png")
+    Image.fromarray(np.full((24, 24, 3), 128, np.uint8)).save(tmp_path / "target.png")
+    target = Target(file=tmp_path / "target.png", mask=tmp_path / "mask.png")
+    Run(problem(room, target=(target,), stage=(Stage(), Stage(resolution=12))))
+    with pytest.raises(ValueError, match=r"target\.0: no pixel counts at 6 x 6"):
+        Run(problem(room, target=(target,), stage=(Stage(), Stage(resolution=6))))
 
 
 @pytest.mark.parametrize(

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import html
-import io
 import json
 import os
 import re
 import shutil
-import subprocess
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import Page, in_browser
 from PIL import Image
 
 from rimlight import scenes
@@ -24,10 +20,6 @@ from rimlight.inverse import fitting, page, problem, report
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
 
 NASTY = '<script>alert("a&b")</script> \'$x^$'
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "microsoft-edge")
-
-VOID = {"meta", "link", "img", "input", "br"}
 
 
 @pytest.fixture(scope="module")
@@ -52,45 +44,6 @@ def folder(fit, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("report") / "new" / "folder"
     report.write(path, fit, title="Two triangles")
     return path
-
-
-class Page(HTMLParser):
-    """What is in a page.
-
-    elements : (tag, attributes). texts : what people read, outside of style and script.
-    """
-
-    def __init__(self, source: str):
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.texts: list[str] = []
-        self.open: list[str] = []
-        self.feed(source)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if not {"style", "script"} & set(self.open):
-            self.texts.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join(self.texts)
-
-    def images(self) -> list[Image.Image]:
-        uris = [attributes["src"] for tag, attributes in self.elements if tag == "img"]
-        return [Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))) for uri in uris]
 
 
 def written(path: Path, fit: fitting.Fit, **options) -> Page:
@@ -328,33 +281,10 @@ window.onload = () => {
 };
 </script>"""
 
-WATCH = """<script>
-const errors = [];
-window.addEventListener("error", (event) => errors.push(String(event.message)), true);
-document.addEventListener("securitypolicyviolation", (event) => errors.push(event.violatedDirective));
-console.error = console.warn = (...words) => errors.push(words.join(" "));
-</script>"""
-
 
 @pytest.mark.parametrize("width", [1200, 500])
 def test_page_works_in_a_browser(folder, tmp_path, width):
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        pytest.skip("needs Chromium or a relative of it")
-    source = (folder / "report.html").read_text("utf-8")
-    watched = source.replace("<title>", f"{WATCH}<title>", 1).replace("</body>", f"{CHECK}</body>", 1)
-    (tmp_path / "page.html").write_text(watched, "utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
-    options += [f"--window-size={width},900", "--virtual-time-budget=3000", "--dump-dom"]
-    try:
-        command = [browser, *options, (tmp_path / "page.html").as_uri()]
-        run = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        pytest.skip(f"{browser} does not run here: {error}")
-    title = re.search(r"<title>(.*?)</title>", run.stdout, re.DOTALL)
-    if title is None:
-        pytest.skip(f"{browser} does not run here: {run.stderr[-300:]}")
-    done = json.loads(html.unescape(title[1]))
+    done = in_browser((folder / "report.html").read_text("utf-8"), CHECK, tmp_path, width)
     assert done["errors"] == []
     assert done["loaded"]
     assert "50%" in done["before"]

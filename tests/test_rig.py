@@ -428,3 +428,37 @@ def test_spectral_variants_are_refused():
             rig()
     finally:
         mi.set_variant("llvm_ad_rgb")
+
+
+def test_paths_go_where_the_density_is():
+    """Images and derivatives stay right in the mean; where it is 0, nothing is rendered. Others are refused."""
+    scene = room(small_lights())
+    integrator, params = rig(max_depth=3), mi.traverse(scene)
+    key = next(k for k in params.keys() if "reflectance" in k)  # noqa: SIM118
+    height, width, _ = np.shape(integrator.render(scene, spp=1))
+    density = 0.2 + np.random.default_rng(0).random((height, width))
+    density[:, :4] = 0
+
+    def measured(pixel_density) -> tuple[np.ndarray, np.ndarray]:
+        integrator.pixel_density = pixel_density
+        images = np.stack([np.array(integrator.render(scene, seed=s, spp=64)) for s in range(12)])[:, :, 4:]
+        found = []
+        for s in range(12):
+            weights = np.ones_like(images[0], shape=(height, width, images.shape[-1]))
+            weights[:, :4] = 0
+            dr.enable_grad(params[key])
+            params.update()
+            integrator.render_backward(scene, params, mi.TensorXf(weights), seed=s, spp=64)
+            found.append(np.array(dr.grad(params[key])).ravel())
+            dr.disable_grad(params[key])
+        return images.mean((1, 2)), np.stack(found)
+
+    even, adapted = measured(None), measured(mi.Float(density.ravel().astype(np.float32)))
+    for a, b in zip(even, adapted, strict=True):
+        error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / len(a))
+        assert np.all(np.abs(a.mean(0) - b.mean(0)) < 4 * error)
+        assert np.all(error < 0.05 * np.abs(a.mean(0)))
+    assert not np.array(integrator.render(scene, spp=4))[:, :4].any()
+    integrator.pixel_density = mi.Float(1, 2, 3)
+    with pytest.raises(RuntimeError, match=r'rig: "pixel_density" needs a box filter, and a number for each of'):
+        integrator.render(scene, spp=1)

@@ -25,6 +25,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from rimlight import merl_tables
 from rimlight.edge_sampling import (
     EdgeKind,
     FiniteDifferences,
@@ -631,6 +632,42 @@ def test_thin_glass_changes():
     assert_exact("thin_glass", stage({"thing": glass, "lamp": back}), "thing.bsdf.eta", 0.02, 512, direction=[1])
 
 
+@pytest.mark.parametrize(
+    ("key", "step", "motion"),
+    [
+        ("thing.vertex_positions", 5e-3, SIDEWAYS),
+        ("thing.bsdf.brdf_0.table", 0.05, {"direction": [1]}),
+        ("plate.vertex_positions", 5e-3, SIDEWAYS),
+    ],
+)
+def test_measured_material(key, step, motion):
+    """A highlight on a diffuse ground, below the plate."""
+    theta_h, theta_d, phi_d = np.meshgrid(*merl_tables.angles(), indexing="ij")
+    table = 0.15 + 0.3 * np.exp(-((theta_h / 0.3) ** 2)) * (1 + 2 * np.sin(theta_d) ** 4 + 0.5 * np.cos(2 * phi_d))
+    material = two({"type": "merl", "table": mi.TensorXf(np.repeat(table[..., None], 3, 3).astype(np.float32))})
+    scene = stage({"thing": sheet("thing", np.array([0.2, -0.4, -0.3]), material), "lamp": lamp("area", 0)})
+    name = re.sub(r"\W+", "_", f"merl_{key}")
+    assert_exact(name, scene, key, step, 128, **motion)
+
+
+@pytest.mark.parametrize(
+    ("key", "step", "motion"),
+    [
+        ("thing.vertex_positions", 5e-3, SIDEWAYS),
+        ("thing.bsdf.brdf_0.weights", 0.05, {"direction": [0.5, 0, 1, 1, 0, 0.5]}),
+        ("plate.vertex_positions", 5e-3, SIDEWAYS),
+    ],
+)
+def test_dictionary_of_lobes(key, step, motion):
+    """A lobe on a diffuse ground, below the plate."""
+    lobes = {"alpha": mi.Float(0.3, np.nan), "eta": mi.Float(3.0, np.nan)}
+    weights = mi.TensorXf([0.5, 0.4, 0.3, 0.3, 0.4, 0.5], shape=(2, 3))
+    material = two({"type": "ggx_dictionary", "weights": weights, **lobes})
+    scene = stage({"thing": sheet("thing", np.array([0.2, -0.4, -0.3]), material), "lamp": lamp("area", 0)})
+    name = re.sub(r"\W+", "_", f"ggx_dictionary_{key}")
+    assert_exact(name, scene, key, step, 128, **motion)
+
+
 # ---------------------- Warnings and refusals ----------------------
 
 
@@ -784,6 +821,8 @@ ELSEWHERE = {
     "`fisheye`": ["fisheye_cube", "fisheye_camera", "fisheye_camera_rotation", "fisheye_field_of_view"],
     "`batch` of the above": ["batch_cube", "batch_camera"],
     "`thindielectric`": [test_thin_glass_changes],
+    "`merl`": [test_measured_material],
+    "`ggx_dictionary`": [test_dictionary_of_lobes],
     "`area` on meshes": ["shadow_light", "room_light"],
     "`area` on `sphere`, `disk`, `cylinder`": ["sphere_light"],
     "`point`": ["lit_room_light", "lit_room_cube"],

@@ -18,7 +18,7 @@ from sphinx.util.nodes import nested_parse_with_titles
 
 from rimlight._registration import plugin_modules
 
-KINDS = ("float", "string", "spectrum", "texture", "point", "vector", "transform", "object")
+KINDS = ("float", "string", "spectrum", "texture", "point", "vector", "transform", "tensor", "object")
 TYPES = {"int": "integer", "bool": "boolean"} | {k: k for k in KINDS}
 FLAGS = {"exposed": "P", "differentiable": "∂", "discontinuous": "D"}
 

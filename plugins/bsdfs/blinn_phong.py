@@ -5,11 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from rimlight import ggx
+from rimlight.ggx import GRAZING
+
 #: Smallest roughness: at it, the half vector's tangent has a standard deviation of 0.007 along each axis.
 SMOOTHEST = 1e-4
-
-#: Cosines are taken to be at least this large, lest powers of their inverses overflow in single precision.
-GRAZING = 1e-6
 
 #: The order of the components, as in `roughplastic`.
 GLOSSY, DIFFUSE = 0, 1
@@ -134,7 +134,7 @@ class BlinnPhongBSDF(mi.BSDF):
         textures, wi = self._eval_textures(si, active), dr.detach(si.wi)
         *_, r = dr.detach(textures)
         of_glossy = mi.Bool(sample1 < _glossy_share(*dr.detach(textures[:2]), wi, glossy, diffuse))
-        reflected = mi.reflect(wi, _sample_visible_normal(r, wi, sample2))
+        reflected = mi.reflect(wi, ggx.sample_visible_normal(r, wi, sample2))
         bs.wo = dr.select(of_glossy, reflected, mi.warp.square_to_cosine_hemisphere(sample2))
         bs.eta = 1
         bs.sampled_type = dr.select(
@@ -190,7 +190,7 @@ def _eval(kd, ks, r, wi, wo, glossy: bool, diffuse: bool) -> mi.Spectrum:
         # Blinn-Phong, Walter et al. 2007, Eq. 30, where 1 + tan² θ = 1 / cos² θ keeps its precision near to the normal.
         D = dr.exp((1 - dr.rcp(r)) * dr.log(1 + _tan2(h))) * dr.inv_pi / r
         # Smith's G / (4 cos θᵢ), without a division by what may vanish.
-        G = cos_o * dr.rcp(2 * (cos_o * _stretched(cos_i, r) + cos_i * _stretched(cos_o, r)))
+        G = cos_o * dr.rcp(2 * (cos_o * ggx.stretched(cos_i, r) + cos_i * ggx.stretched(cos_o, r)))
         # ωᵢ · h / |h| = |h| / 2
         F = ks + (1 - ks) * _schlick(0.5 * dr.norm(h))
         result += F * (D * G)
@@ -203,12 +203,9 @@ def _eval(kd, ks, r, wi, wo, glossy: bool, diffuse: bool) -> mi.Spectrum:
 def _pdf(kd, ks, r, wi, wo, glossy: bool, diffuse: bool) -> mi.Float:
     """Density of `BlinnPhongBSDF.sample`, per sr, of directions above the surface. Detached."""
     kd, ks, r, wi, wo = dr.detach((kd, ks, r, wi, wo))
-    cos_i, cos_o = dr.maximum(wi.z, GRAZING), dr.maximum(wo.z, GRAZING)
     share = _glossy_share(kd, ks, wi, glossy, diffuse)
-    tan2 = _tan2(mi.Vector3f(wi.x + wo.x, wi.y + wo.y, cos_i + cos_o))
-    D = r * dr.square((1 + tan2) / (r + tan2)) * dr.inv_pi
-    result = share * D * dr.rcp(2 * (cos_i + _stretched(cos_i, r)))  # D G₁(ωᵢ) / (4 cos θᵢ)
-    return result + (1 - share) * cos_o * dr.inv_pi if diffuse else result
+    result = share * ggx.reflected_density(r, wi, wo)
+    return result + (1 - share) * dr.maximum(wo.z, GRAZING) * dr.inv_pi if diffuse else result
 
 
 def _glossy_share(kd, ks, wi, glossy: bool, diffuse: bool) -> mi.Float:
@@ -219,22 +216,6 @@ def _glossy_share(kd, ks, wi, glossy: bool, diffuse: bool) -> mi.Float:
     s = dr.mean(dr.abs(ks + (1 - ks) * schlick))
     d = dr.mean(dr.abs(kd * (1 - ks))) * (1 - schlick)
     return dr.select(s + d > 0, s / (s + d), 0.5)
-
-
-def _sample_visible_normal(r, wi, sample) -> mi.Normal3f:
-    """A normal of the GGX distribution of alpha² = r, as visible from `wi`. Dupuy and Benyoub 2023."""
-    alpha = dr.sqrt(r)
-    stretched = dr.normalize(mi.Vector3f(alpha * wi.x, alpha * wi.y, dr.maximum(wi.z, GRAZING)))
-    height = (1 - sample.x) * (1 + stretched.z)
-    sin = dr.safe_sqrt(1 - dr.square(height - stretched.z))
-    sin_phi, cos_phi = dr.sincos(dr.two_pi * sample.y)
-    x, y = sin * cos_phi + stretched.x, sin * sin_phi + stretched.y
-    return mi.Normal3f(dr.normalize(mi.Vector3f(alpha * x, alpha * y, dr.maximum(height, GRAZING))))
-
-
-def _stretched(cos, r) -> mi.Float:
-    """√(cos² θ + r sin² θ)"""
-    return dr.sqrt(dr.fma(dr.square(cos), 1 - r, r))
 
 
 def _tan2(h) -> mi.Float:

@@ -440,13 +440,27 @@ class _Reproduce:
     """Run the fits of Li et al. 2018 (figures 1 and 6), with a report of each and a table of all."""
 
 
+@dataclass(frozen=True)
+class _Reflectance:
+    """Fit weights of lobes to measured reflectance, or choose the lobes."""
+
+
+@dataclass(frozen=True)
+class _Ps:
+    """Photometric stereo: shape and reflectance from images under many lights."""
+
+
 def commands(argv: Sequence[str]) -> dict[str, type]:
     """Commands by their names. argv : for one whose options depend on a file that they name."""
-    fit, reproduce = _Fit, _Reproduce
+    fit, reproduce, reflectance, ps = _Fit, _Reproduce, _Reflectance, _Ps
     if argv[:1] in (["fit"], ["reproduce"]):
         from . import _fit  # only now, since it imports much
 
         fit, reproduce = _fit.command(argv), _fit.Reproduce
+    if argv[:1] == ["reflectance"]:
+        from ._reflectance import Reflectance as reflectance
+    if argv[:1] == ["ps"]:
+        from ._ps import Ps as ps
     return {
         "sys-info": SysInfo,
         "params": Params,
@@ -457,5 +471,7 @@ def commands(argv: Sequence[str]) -> dict[str, type]:
         "finite-differences": FiniteDifferencesCommand,
         "fit": fit,
         "reproduce": reproduce,
+        "reflectance": reflectance,
+        "ps": ps,
         "demo": Demo,
     }

@@ -92,17 +92,17 @@ def at_least(minimum: int | float, **options: int | float) -> None:
 # ------------------------------------------------------------------ output
 
 
-def check_output(path: Path, *, folder: bool) -> None:
+def check_output(path: Path, *, folder: bool, option: str = "--out") -> None:
     """Find out before the work begins whether a folder or file can be written. Creates nothing."""
     if path.exists() and path.is_dir() != folder:
-        raise InputError(f'--out: "{path}" is {"not a folder" if folder else "a folder"}')
+        raise InputError(f'{option}: "{path}" is {"not a folder" if folder else "a folder"}')
     existing = path.absolute() if folder else path.absolute().parent
     while not existing.exists():
         existing = existing.parent
     if not existing.is_dir():
-        raise InputError(f'--out: cannot write "{path}": "{existing}" is not a folder')
+        raise InputError(f'{option}: cannot write "{path}": "{existing}" is not a folder')
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(f'--out: cannot write "{path}": no permission in "{existing}"')
+        raise InputError(f'{option}: cannot write "{path}": no permission in "{existing}"')
 
 
 def make_folder(path: Path) -> Path:

@@ -81,6 +81,10 @@ class RigIntegrator(EdgeIntegrator):
     **Boundaries.** On the film, both sides of an edge see all lights. Of the boundaries at shading points, the shadows
     that lights throw on what the camera sees are found from the lights, hard and soft ones.
 
+    **Adaptive sampling.** :monosp:`integrator.pixel_density`, a number for each pixel of the film, row by row (Python
+    only, default :monosp:`None`: all alike), distributes the camera paths over the pixels in proportion to it; those of
+    density 0 stay black. Images and derivatives stay right in the mean. For the box filter only.
+
     **Names.** :monosp:`integrator.light_names(scene)` lists the names of the layers, and
     :monosp:`rimlight.edge_sampling.exr` has :monosp:`write_layers` and :monosp:`read_layers` for OpenEXR files with
     named layers.
@@ -111,6 +115,7 @@ class RigIntegrator(EdgeIntegrator):
         if mi.is_spectral:
             raise ValueError(f"{who}: spectral variants are not supported, got {mi.variant()}")
         self.lights_per_path = values["lights_per_path"]
+        self.pixel_density: mi.Float | None = None
 
     # ---------------------- Mitsuba's interface ----------------------
 
@@ -218,6 +223,25 @@ class RigIntegrator(EdgeIntegrator):
         if sppi > 0 and (self.depths.scatters(2) or scene.environment() is not None):
             limits = (*(limit for limit in limits if limit != HARD_SHADOWS), SHADOWS_ON_FILM)
         return limits
+
+    def sample_rays(self, scene, sensor, sampler):
+        if self.pixel_density is None:
+            return super().sample_rays(scene, sensor, sampler)
+        film = sensor.film()
+        size, count = mi.ScalarVector2u(film.crop_size()), dr.width(self.pixel_density)
+        if count != size.x * size.y or not film.rfilter().is_box_filter():
+            raise RuntimeError(
+                f'{self.name}: "pixel_density" needs a box filter, and a number for each of {size.x} x {size.y} '
+                f"pixels, got {count}"
+            )
+        pixels = mi.DiscreteDistribution(self.pixel_density)
+        pixel, probability = pixels.sample_pmf(sampler.next_1d())
+        corner = mi.Vector2f(mi.Float(pixel % size.x), mi.Float(pixel // size.x))
+        position = corner + sampler.next_2d()
+        on_film = mi.Point2f(position / mi.Vector2f(size))
+        aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
+        ray, weight = sensor.sample_ray_differential(0, sampler.next_1d(), on_film, aperture)
+        return ray, weight / (probability * count), mi.Point2f(position + film.crop_offset())
 
     # ---------------------- Lights ----------------------
 

@@ -1,0 +1,335 @@
+"""Data sets of photometric stereo: images of one view, a light for each, and a mask.
+
+Axes, in all of this package: x to the right, y up, z towards the camera. Rows of arrays go down.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from rimlight.inverse.targets import read_picture, srgb_to_linear
+from rimlight.leds import Led, read_leds, write_leds
+
+from .integration import check_camera
+
+#: Of linear sRGB; those with which published results on DiLiGenT weigh the channels.
+LUMINANCE = np.array([0.2989, 0.5870, 0.1140], np.float32)
+
+DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE = (
+    "light_directions.txt",
+    "light_intensities.txt",
+    "filenames.txt",
+    "leds.csv",
+    "K.txt",
+    "distance.txt",
+)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """K images of P pixels, those of the mask, in the order of its rows.
+
+    Raises
+    ------
+    ValueError : shapes do not agree; a value is not finite; the mask is empty; there are fewer than three lights; the
+        camera is no intrinsic matrix; lights are near without a camera or a distance.
+    """
+
+    #: (P, K, 3), float32: linear radiance over the intensity of the light, which is irradiance for lights at infinity.
+    values: np.ndarray
+    #: (H, W), bool.
+    mask: np.ndarray
+    #: (K, 3): unit directions towards lights at infinity; or K LEDs, in camera coordinates, as far as known of
+    #: intensity 1.
+    lights: np.ndarray | tuple[Led, ...]
+    #: (K, 3): intensities that `values` have been divided by, linear sRGB.
+    intensities: np.ndarray
+    #: Intrinsic matrix, (3, 3), pixels; pixel (0, 0) has its centre at (0, 0). None: orthographic.
+    camera: np.ndarray | None = None
+    #: True normals, (P, 3), if known.
+    truth: np.ndarray | None = None
+    #: Of the images.
+    names: tuple[str, ...] = ()
+    #: Mean (geometric) of the depth of the object, or of each of its parts, along the axis of the camera, in the unit
+    #: of the LEDs: normals leave the scale of depth open, and near lights do not. Needed with these only.
+    distance: float | None = None
+
+    def __post_init__(self):
+        P, K, channels = self.values.shape
+        if self.mask.sum() != P or channels != 3:
+            raise ValueError(f"ps: values of the shape {self.values.shape} for {self.mask.sum()} pixels of the mask")
+        if not P:
+            raise ValueError("ps: the mask is empty")
+        if len(self.lights) != K or self.intensities.shape != (K, 3):
+            raise ValueError(
+                f"ps: {K} images, {len(self.lights)} lights and {len(self.intensities)} intensities: there must be as "
+                "many of each"
+            )
+        if K < 3:
+            raise ValueError(f"ps: at least three images are needed, got {K}")
+        if bad := int((~np.isfinite(self.values)).any((1, 2)).sum()):
+            raise ValueError(f"ps: {bad} pixels of the mask have values that are not finite; take them out of the mask")
+        check_camera("ps", self.camera)
+        if self.near and self.camera is None:
+            raise ValueError(f"ps: lights at finite distance need a camera; write its matrix to {CAMERA}")
+        if self.near and self.distance is None:
+            raise ValueError(
+                f"ps: lights at finite distance need the distance of the object from the camera; write it to {DISTANCE}"
+            )
+        if self.distance is not None and not 0 < self.distance < np.inf:
+            raise ValueError(f"ps: the distance must be positive, got {self.distance}")
+
+    @property
+    def near(self) -> bool:
+        """Are the lights at finite distances?"""
+        return not isinstance(self.lights, np.ndarray)
+
+    @property
+    def luminance(self) -> np.ndarray:
+        """(P, K)"""
+        return self.values @ LUMINANCE
+
+    def at(self, size: float) -> Dataset:
+        """The data set with images of another size: means over those of its pixels that lie in the mask.
+
+        size : width and height over those of these, 1 over a whole number, such as 1/4.
+
+        Raises
+        ------
+        ValueError : no pixel is left.
+        """
+        step = round(1 / size)
+        if step == 1:
+            return self
+        mask, mean = self.blocks(step)
+        if not mask.any():
+            raise ValueError(f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left")
+        camera = self.camera
+        if camera is not None:  # the centre of the first coarse pixel lies (step - 1) / 2 behind that of the first
+            camera = camera.copy()
+            camera[:2, 2] -= (step - 1) / 2
+            camera[:2] /= step
+        truth = None if self.truth is None else unit(mean(self.truth))
+        return replace(self, values=mean(self.values).astype(np.float32), mask=mask, camera=camera, truth=truth)
+
+    def blocks(self, step: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """Coarse pixels, of step x step of these: their mask, where at least half of a block is in the mask; and what
+        makes means, (P', ...), over each block's pixels of the mask, of numbers of all pixels, (P, ...)."""
+        H, W = (-(-n // step) * step for n in self.mask.shape)
+        mask = np.zeros((H, W), bool)
+        mask[: self.mask.shape[0], : self.mask.shape[1]] = self.mask
+        coarse = mask.reshape(H // step, step, W // step, step).sum((1, 3)) * 2 >= step * step
+        # Coarse pixel of each pixel, and means by sums over them
+        target = np.full(coarse.shape, -1)
+        target[coarse] = np.arange(coarse.sum())
+        rows, columns = np.nonzero(self.mask)
+        group = target[rows // step, columns // step]
+        members = np.flatnonzero(group >= 0)
+        members = members[np.argsort(group[members], kind="stable")]
+        first = np.flatnonzero(np.diff(group[members], prepend=-1))
+        counts = np.diff(first, append=len(members))
+        mean = lambda x: np.add.reduceat(x[members], first, axis=0) / counts.reshape(-1, *[1] * (x.ndim - 1))
+        return coarse, mean
+
+    def image(self, pixels: np.ndarray, fill: float = 0) -> np.ndarray:
+        """(H, W, ...) of numbers of the pixels, (P, ...)."""
+        found = np.full((*self.mask.shape, *pixels.shape[1:]), fill, pixels.dtype)
+        found[self.mask] = pixels
+        return found
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length 1; those of length 0 face the camera."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1), [0, 0, 1])
+
+
+def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Between vectors (..., 3), degrees. Accurate for small ones, too."""
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
+
+
+# ---------------------- Folders ----------------------
+
+
+def read(folder: Path, *, images: int = 0) -> Dataset:
+    """Read a folder as DiLiGenT's (Shi et al. 2019): `filenames.txt` (else all pictures but the mask, by name),
+    `light_directions.txt` or `leds.csv`, `light_intensities.txt` (default 1), `mask.png`; if there, `K.txt` (3 x 3,
+    else orthographic), `distance.txt` (see `Dataset.distance`), and `Normal_gt.mat` or `Normal_gt.exr`.
+
+    Pictures are EXR, PNG, which is taken to be linear as DiLiGenT's are, or JPEG, which is decoded from sRGB.
+
+    images : read only so many, evenly from their list. 0: all.
+
+    Raises
+    ------
+    ValueError : a file says what cannot be; sizes or numbers do not agree. OSError : one cannot be read.
+    """
+    folder = Path(folder)
+    names, mask = read_names(folder), read_mask(folder / "mask.png")
+    near = (folder / LEDS).is_file()
+    if near:
+        leds = read_leds(folder / LEDS)
+        intensities = np.array([led.intensity for led in leds])
+        lights: np.ndarray | tuple[Led, ...] = tuple(replace(led, intensity=(1.0, 1.0, 1.0)) for led in leds)
+    else:
+        directions = _numbers(folder / DIRECTIONS, 3)
+        if (lengths := np.linalg.norm(directions, axis=1)).min() == 0:
+            raise ValueError(f"ps: {DIRECTIONS}, line {lengths.argmin() + 1}: the direction is zero")
+        lights = directions / lengths[:, None]
+        given = folder / INTENSITIES
+        intensities = _numbers(given, 3) if given.is_file() else np.ones_like(lights)
+    if len(lights) != len(names) or len(intensities) != len(names):
+        raise ValueError(
+            f"ps: {folder.name}: {len(names)} images, {len(lights)} lights, {len(intensities)} intensities: there must "
+            "be as many of each"
+        )
+    if (intensities <= 0).any():
+        raise ValueError(f"ps: {folder.name}: light {int((intensities <= 0).any(1).argmax()) + 1} has no intensity")
+    if 0 < images < len(names):
+        chosen = np.arange(images) * len(names) // images
+        names, intensities = [names[k] for k in chosen], intensities[chosen]
+        lights = tuple(lights[k] for k in chosen) if near else lights[chosen]
+    values = np.empty((mask.sum(), len(names), 3), np.float32)
+    for k, name in enumerate(tqdm(names, desc="images", disable=True if len(names) < 10 else None, leave=False)):
+        values[:, k] = read_pixels(folder / name, mask) / intensities[k]
+    camera = read_camera(folder)
+    distance = _numbers(folder / DISTANCE, 1)[0, 0] if (folder / DISTANCE).is_file() else None
+    return Dataset(values, mask, lights, intensities, camera, _truth(folder, mask), tuple(names), distance)
+
+
+def write(folder: Path, data: Dataset) -> None:
+    """Write a folder that `read` reads: EXR images of full precision, whatever the names of the data end with.
+
+    Raises
+    ------
+    OSError
+    """
+    from rimlight.edge_sampling.exr import write_exr
+
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [Path(name).stem + ".exr" for name in data.names or [f"{k + 1:03d}" for k in range(len(data.lights))]]
+    for k, name in enumerate(names):
+        write_exr(folder / name, {"": data.image(data.values[:, k] * data.intensities[k].astype(np.float32))})
+    (folder / NAMES).write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+    if data.near:
+        pairs = zip(data.lights, data.intensities, strict=True)
+        write_leds(folder / LEDS, [replace(led, intensity=tuple(map(float, rgb))) for led, rgb in pairs])
+    else:
+        np.savetxt(folder / DIRECTIONS, data.lights, "%.9g")
+        np.savetxt(folder / INTENSITIES, data.intensities, "%.9g")
+    if data.camera is not None:
+        np.savetxt(folder / CAMERA, data.camera, "%.9g")
+    if data.distance is not None:
+        np.savetxt(folder / DISTANCE, [data.distance], "%.9g")
+    if data.truth is not None:
+        write_exr(folder / "Normal_gt.exr", {"": data.image(data.truth.astype(np.float32))})
+    from PIL import Image
+
+    Image.fromarray(data.mask.astype(np.uint8) * 255).save(folder / "mask.png")
+
+
+def extent(folder: Path) -> tuple[int, int]:
+    """Pixels of the mask, and images, of a folder, none of which is read. Raises what `read` does."""
+    images = len(read_names(folder))
+    return int(read_mask(folder / "mask.png").sum()), images
+
+
+def read_names(folder: Path) -> list[str]:
+    """Of the images of a folder: those that `filenames.txt` lists, else all pictures but masks and truths, by name.
+
+    Raises
+    ------
+    OSError : there is no such folder.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f'ps: there is no folder "{folder}"')
+    if (folder / NAMES).is_file():
+        lines = (folder / NAMES).read_text(encoding="utf-8").splitlines()
+        return [line.strip() for line in lines if line.strip()]
+    kinds = (".png", ".exr", ".jpg", ".jpeg")
+    other = lambda p: p.stem.lower().endswith("mask") or p.stem.lower() in ("normal_gt", "depth_gt")
+    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in kinds and not other(p))
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """(H, W), bool: what is brighter than half of the brightest. Raises what `read` does."""
+    picture = _numbers_of_picture(path)[..., 0]
+    return picture > picture.max() / 2
+
+
+def read_pixels(path: Path, mask: np.ndarray) -> np.ndarray:
+    """Of a picture, the pixels of a mask: (P, 3), linear. Raises what `read` does."""
+    picture = _numbers_of_picture(path)
+    if picture.shape[:2] != mask.shape:
+        (h, w), (H, W) = picture.shape[:2], mask.shape
+        raise ValueError(f'ps: "{path.name}" has {w} x {h} pixels, the mask {W} x {H}')
+    pixels = picture[mask]
+    if pixels.shape[1] in (2, 4):
+        pixels = pixels[:, :-1]
+    if pixels.shape[1] not in (1, 3):
+        raise ValueError(f'ps: "{path.name}" has {pixels.shape[1]} channels, expected grey or colours')
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        pixels = srgb_to_linear(pixels)
+    return np.broadcast_to(pixels, (len(pixels), 3))
+
+
+def read_camera(folder: Path) -> np.ndarray | None:
+    """Intrinsic matrix, (3, 3), if the folder has one. Raises what `read` does."""
+    if not (folder / CAMERA).is_file():
+        return None
+    camera = _numbers(folder / CAMERA, 3)
+    check_camera(f"ps: {CAMERA}", camera)
+    return camera
+
+
+def _numbers_of_picture(path: Path) -> np.ndarray:
+    """(H, W, C), float32."""
+    try:
+        return read_picture(path)[0]
+    except (OSError, ValueError) as error:
+        raise type(error)(re.sub("^fit: ", "ps: ", str(error))) from None
+
+
+def _numbers(path: Path, columns: int) -> np.ndarray:
+    """A text file of numbers: (lines, columns)."""
+    if not path.is_file():
+        raise FileNotFoundError(f'ps: there is no file "{path}"')
+    try:
+        rows = [
+            [float(word) for word in line.partition("#")[0].split()]
+            for line in path.read_text(encoding="utf-8").splitlines()
+        ]
+    except ValueError as error:
+        raise ValueError(f"ps: {path.name}: {error}") from None
+    rows = [row for row in rows if row]
+    for k, row in enumerate(rows, 1):
+        if len(row) != columns or not np.isfinite(row).all():
+            raise ValueError(f"ps: {path.name}, row {k}: expected finite numbers, {columns} of them, got {row}")
+    if not rows:
+        raise ValueError(f"ps: {path.name} is empty")
+    return np.array(rows)
+
+
+def _truth(folder: Path, mask: np.ndarray) -> np.ndarray | None:
+    if (path := folder / "Normal_gt.exr").is_file():
+        normals = _numbers_of_picture(path)
+    elif (path := folder / "Normal_gt.mat").is_file():
+        from scipy.io import loadmat
+
+        try:
+            arrays = [a for name, a in loadmat(path).items() if not name.startswith("_")]
+        except (ValueError, TypeError, NotImplementedError) as error:
+            raise ValueError(f"ps: cannot read {path.name}: {error}") from None
+        normals = next((a for a in arrays if np.ndim(a) == 3 and a.shape[2] == 3), None)
+    else:
+        return None
+    if normals is None or normals.shape != (*mask.shape, 3):
+        raise ValueError(f"ps: {path.name} holds no normals of the size of the mask")
+    return unit(normals[mask].astype(np.float64))

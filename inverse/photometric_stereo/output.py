@@ -1,0 +1,181 @@
+"""What a reconstruction found, as files for other programs."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import rimlight
+from rimlight import ggx
+from rimlight.edge_sampling.exr import replacing, write_exr
+from rimlight.inverse import page
+
+from .direct import bsdf_of, own
+from .integration import depth_error, mesh_of
+from .reconstruction import Options, Result
+
+#: Angles of incidence for which a BSDF is drawn, degrees.
+INCIDENCES = (0, 30, 60)
+
+#: Resolution of pictures of plots, per inch.
+DPI = 130
+
+
+def snapshot(result: Result) -> Result:
+    """A copy that further alternations leave alone."""
+    return dataclasses.replace(result, guess=copy.deepcopy(result.guess), history=list(result.history))
+
+
+def write_numbers(
+    folder: Path, result: Result, options: Options, *, status: str, truth: np.ndarray | None = None
+) -> None:
+    """Write what was found, each file at once: after an alternation, say, lest it is lost.
+
+    ``normals.exr``, ``depth.exr``, ``albedo.exr``: 0 outside the mask, at the resolution reached. ``bsdf.json``: for
+    the plugin ``ggx_dictionary``, see `bsdf`. ``exposures.txt``: a line for each image. ``metadata.json``.
+
+    status : "running", "finished" or "interrupted". truth : (H, W), of depth.
+
+    Raises
+    ------
+    OSError
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    data, guess = result.data, result.guess
+    unit = "pixels, towards the camera, mean 0"
+    if data.camera is not None:
+        unit = "along the axis, " + ("unknown unit, geometric mean 1" if data.distance is None else "unit of the LEDs")
+    write_exr(folder / "normals.exr", {"": data.image(guess.normals)}, {"axes": "x right, y up, z towards the camera"})
+    write_exr(folder / "depth.exr", {"": data.image(depth(result))[..., None]}, {"unit": unit})
+    write_exr(folder / "albedo.exr", {"": data.image(guess.albedo)[..., None]}, {"unit": "of bsdf.json"})
+    weights, factor = bsdf(result)
+    with replacing(folder / "bsdf.json") as temporary:
+        ggx.write(temporary, result.lobes, weights)
+    with replacing(folder / "exposures.txt") as temporary:
+        np.savetxt(temporary, guess.exposures, "%.6g")
+    content = {
+        "status": status,
+        "mean_angular_error_degrees": result.error,
+        "depth_error": error_of_depth(result, truth),
+        "seconds": round(result.seconds, 3),
+        "size": [*data.mask.shape[::-1]],
+        "pixels": len(data.values),
+        "images": list(data.names) or len(data.lights),
+        "unit_of_depth": unit,
+        "factor_of_bsdf": factor,
+        "options": dataclasses.asdict(options),
+        "versions": versions(),
+        "history": result.history,
+    }
+    with replacing(folder / "metadata.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+
+
+def write_pictures(folder: Path, result: Result) -> None:
+    """Write ``normals.png``, 16 bits, (n + 1) / 2; ``bsdf.png``; ``mesh.ply``, a vertex at the centre of each pixel.
+
+    Raises
+    ------
+    OSError
+    """
+    data = result.data
+    encoded = np.round((data.image(result.guess.normals.astype(np.float32), -1) + 1) / 2 * 65535).astype(np.uint16)
+    with replacing(folder / "normals.png") as temporary:
+        mi.Bitmap(encoded).write(str(temporary), mi.Bitmap.FileFormat.PNG)
+    figure = bsdf_figure(result)
+    FigureCanvasAgg(figure)
+    with replacing(folder / "bsdf.png") as temporary:
+        figure.savefig(temporary, format="png", dpi=DPI)
+    vertices, faces, _ = mesh_of(data.image(depth(result)), data.mask, camera=data.camera)
+    mesh = make_mesh(vertices, faces, result.guess.normals)
+    mesh.add_attribute("vertex_albedo", 1, result.guess.albedo.astype(np.float32))
+    with replacing(folder / "mesh.ply") as temporary:
+        mesh.write_ply(str(temporary))
+
+
+# ---------------------- Parts of a result ----------------------
+
+
+def depth(result: Result) -> np.ndarray:
+    """Of the pixels of the mask, (P,)."""
+    return result.depth[result.domain.inner]
+
+
+def error_of_depth(result: Result, truth: np.ndarray | None) -> float | None:
+    """Mean absolute error after alignment, in the unit of the truth, (H, W); None where it is not known."""
+    data = result.data
+    if truth is None or truth.shape != data.mask.shape:
+        return None
+    align = "offset" if data.camera is None else "scale"
+    return depth_error(data.image(depth(result)), truth, data.mask, align=align)
+
+
+def bsdf(result: Result) -> tuple[np.ndarray, float]:
+    """Weights, (B, 3), and the factor by which they must be multiplied to give the values of the images: 1, unless
+    these are so bright that the weights would sum to more than 1."""
+    weights = result.guess.weights / result.scale
+    factor = max(float(weights.sum(0).max()), 1.0)
+    return weights / factor, factor
+
+
+def versions() -> dict[str, str]:
+    return {"rimlight": rimlight.__version__, "mitsuba": mi.__version__, "drjit": dr.__version__}
+
+
+def make_mesh(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, bsdf: mi.BSDF | None = None) -> mi.Mesh:
+    """vertices, normals : (V, 3). faces : (F, 3)."""
+    props = mi.Properties()
+    if bsdf is not None:
+        props["mesh_bsdf"] = bsdf
+    mesh = mi.Mesh("object", len(vertices), len(faces), props, has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+    params["vertex_positions"] = own(vertices)
+    params.update()
+    # After the positions, an update of which makes normals anew
+    params["vertex_normals"] = own(normals)
+    params.update()
+    return mesh
+
+
+# ---------------------- Plot of the BSDF ----------------------
+
+
+def reflected(bsdf: mi.BSDF, incidence: float, outgoing: np.ndarray) -> np.ndarray:
+    """f cos θₒ in the plane of incidence, (N, 3).
+
+    incidence : degrees. outgoing : (N,), degrees; the mirror direction is that of the incidence.
+    """
+    sin, cos = np.sin(np.radians([incidence, *outgoing])), np.cos(np.radians([incidence, *outgoing]))
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(float(-sin[0]), 0, float(cos[0]))
+    wo = mi.Vector3f(mi.Float(sin[1:].astype(np.float32)), 0, mi.Float(cos[1:].astype(np.float32)))
+    return np.array(bsdf.eval(mi.BSDFContext(), si, wo)).T
+
+
+def bsdf_figure(result: Result) -> Figure:
+    """Slices of the BSDF, one plot for each colour."""
+    weights, _ = bsdf(result)
+    found = bsdf_of(result.lobes, weights)
+    outgoing = np.linspace(-89, 89, 357)
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    for c, (axes, colour) in enumerate(zip(figure.subplots(1, 3, sharey=True), ("red", "green", "blue"), strict=True)):
+        for i, incidence in enumerate(INCIDENCES):
+            values = reflected(found, incidence, outgoing)[:, c]
+            axes.plot(outgoing, values, color=page.COLOURS[i], linewidth=1.3, label=f"θᵢ = {incidence}°")
+        axes.set(xlabel="θₒ, degrees", ylabel="" if c else "f cos θₒ, 1/sr")
+        axes.set_title(colour, fontsize=9, color=page.INK)
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], axes.get_ylim()[1] * 1e-4))
+        page.paint(axes)
+        if c == 0:
+            axes.legend(fontsize=7.5, labelcolor=page.INK, framealpha=0, edgecolor="none")
+    return figure

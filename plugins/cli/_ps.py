@@ -1,0 +1,167 @@
+"""`rimlight ps`: photometric stereo, and data sets for it."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from rimlight.edge_sampling.exr import read_exr
+from rimlight.inverse.photometric_stereo import calibration, dataset, output, reconstruction, report, simulation
+from rimlight.loading import InputError, expected, use_variant
+
+from ._commands import REFUSAL
+from ._loading import at_least, check_output
+
+#: Bytes of memory for each value, which is that of a pixel in an image: of reading, and of a reconstruction. Measured.
+READING, RECONSTRUCTION = 40, 125
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """Reconstruct normals, depth and reflectance of a data set."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Images, lights and a mask, in the layout of DiLiGenT."""
+    out: Path
+    """Folder for the results."""
+    images: int = 0
+    """Use so many of the images, evenly from their list. 0: all."""
+    variant: str = "llvm_ad_rgb"
+    """Variant of Mitsuba."""
+    options: Annotated[reconstruction.Options, arg(name="")] = field(default_factory=reconstruction.Options)
+
+    def run(self) -> int:
+        at_least(0, images=self.images)
+        check_output(self.out, folder=True)
+        if (self.out / "metadata.json").exists():
+            raise InputError(f'--out: "{self.out}" holds a result already; remove it, or name another folder')
+        use_variant(self.variant)
+        logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
+        with expected(OSError, ValueError):
+            self._check_memory()
+            data, truth = dataset.read(self.folder, images=self.images), _true_depth(self.folder)
+        with expected(OSError), expected(ValueError, RuntimeError, pattern=REFUSAL):
+            return self._reconstruct(data, truth)
+
+    def _check_memory(self) -> None:
+        pixels, images = dataset.extent(self.folder)
+        values = pixels * (min(images, self.images) if self.images else images)
+        finest = max(self.options.resolutions)
+        needed = values * (READING + RECONSTRUCTION * finest**2)
+        if (there := _available_memory()) is not None and needed > there:
+            raise InputError(
+                f"{values / pixels:.0f} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
+                f"{there / 2**30:.1f} GiB are available; use fewer of the --images, or smaller --resolutions"
+            )
+
+    def _reconstruct(self, data: dataset.Dataset, truth: np.ndarray | None) -> int:
+        found: reconstruction.Result | None = None
+
+        def after(result: reconstruction.Result) -> None:
+            nonlocal found
+            found = output.snapshot(result)
+            output.write_numbers(self.out, found, self.options, status="running", truth=truth)
+
+        status = "finished"
+        try:
+            reconstruction.reconstruct(data, self.options, progress=sys.stderr.isatty(), after=after)
+        except KeyboardInterrupt:
+            if found is None:
+                raise
+            status = "interrupted"
+            print("rimlight: interrupted; writing what was found", file=sys.stderr)
+        output.write_numbers(self.out, found, self.options, status=status, truth=truth)
+        output.write_pictures(self.out, found)
+        title = f"Photometric stereo: {self.folder.resolve().name}"
+        report.write(self.out, found, self.options, title=title, status=status, truth=truth)
+        print(f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s")
+        print(f"report: {self.out / 'report.html'}")
+        if (error := output.error_of_depth(found, truth)) is not None:
+            print(f"mean error of depth {error:.3g} {'pixels' if data.camera is None else ''}".rstrip())
+        if found.error is not None:
+            print(f"mean angular error {found.error:.2f} deg")
+        return 0 if status == "finished" else 130
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Make a data set with a known truth, by path tracing."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder for the data set."""
+    variant: str = "llvm_ad_rgb"
+    """Variant of Mitsuba."""
+    options: Annotated[simulation.Options, arg(name="")] = field(default_factory=simulation.Options)
+
+    def run(self) -> int:
+        check_output(self.out, folder=True, option="OUT")
+        if (self.out / dataset.NAMES).exists():
+            raise InputError(f'OUT: "{self.out}" holds a data set already; remove it, or name another folder')
+        use_variant(self.variant)
+        with expected(OSError), expected(ValueError, pattern=REFUSAL):
+            data, depth = simulation.simulate(self.options, progress=sys.stderr.isatty())
+            simulation.write(self.out, data, depth, self.options)
+        pixels, K, _ = data.values.shape
+        print(f"{K} images, {pixels} pixels of the mask")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrate:
+    """Find the directions of lights from pictures of a ball."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Pictures of a ball, one for each light. The lights are written there."""
+    ball: Path
+    """Mask of the ball, a picture."""
+    kind: Literal["chrome", "matte"]
+    """Of ball: a mirror; or a Lambertian one, which tells intensities, too."""
+
+    def run(self) -> int:
+        use_variant("llvm_ad_rgb")
+        with expected(OSError), expected(ValueError, pattern=REFUSAL):
+            directions, intensities = calibration.calibrate(self.folder, self.ball, self.kind)
+        files = [dataset.DIRECTIONS] + [dataset.INTENSITIES] * (intensities is not None)
+        print(f"{len(directions)} lights: {', '.join(str(self.folder / name) for name in files)}")
+        return 0
+
+
+Command = (
+    Annotated[Run, subcommand("run")]
+    | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Calibrate, subcommand("calibrate")]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ps:
+    """Photometric stereo: shape and reflectance from images under many lights."""
+
+    command: OmitSubcommandPrefixes[Command]
+
+    def run(self) -> int:
+        return self.command.run()
+
+
+def _true_depth(folder: Path) -> np.ndarray | None:
+    """(H, W), if there is a file."""
+    if not (folder / simulation.TRUE_DEPTH).is_file():
+        return None
+    layers, _ = read_exr(folder / simulation.TRUE_DEPTH)
+    return next(iter(layers.values()))[..., 0]
+
+
+def _available_memory() -> int | None:
+    """Bytes, where the system tells it."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    return found[0] if found else None
