@@ -578,12 +578,12 @@ def twosided(bsdf: mi.BSDF) -> dict:
 
 
 def stage(bsdf: mi.BSDF, **lights) -> mi.Scene:
-    """A ball on a floor."""
+    """A ball above a floor: where they touch, rounding decides which shadow rays are blocked."""
     lights = lights or {"lamp": {"type": "point", "position": [-2, 4, -3], "intensity": 20.0}, "sky": cases.constant()}
     return cases.scene(
         sensor=cases.camera((0, 2, -4), (0, 0, 0), film=cases.film(width=16, height=16)),
         floor=cases.horizontal((0, -1, 0), 3, "floor", bsdf=twosided(bsdf)),
-        ball={"type": "sphere", "bsdf": twosided(bsdf)},
+        ball={"type": "sphere", "radius": 0.8, "bsdf": twosided(bsdf)},
         **lights,
     )
 

@@ -74,7 +74,8 @@ class Rendering:
 
     Raises
     ------
-    ValueError : the pixels of the camera are not square; so many lights there are not; or they are at finite distances, of which all are rendered.
+    ValueError : the pixels of the camera are not square; so many lights there are not; or they are at finite
+        distances, of which all are rendered.
     """
 
     def __init__(self, data: Dataset, lobes: ggx.Lobes, *, max_depth: int = 3, lights: int = 0):
