@@ -371,6 +371,22 @@ def test_depth_error() -> None:
         assert found == pytest.approx(best, abs=2e-3) and found > 0.1
 
 
+@pytest.mark.parametrize(
+    "camera", [None, np.array([[30.0, 0, 9], [0, 30, 9], [0, 0, 1]])], ids=["orthographic", "camera"]
+)
+def test_depth_error_aligns_rigidly(camera: np.ndarray | None) -> None:
+    """A tilted plane is a plane; of bumps, what no motion explains is left."""
+    mask = np.ones((20, 20), bool)
+    v, u = np.indices(mask.shape)
+    level, slope = np.full(mask.shape, 20.0), 0.002 * (u - 9) + 0.001 * (v - 9)
+    tilted = level + slope if camera is None else 3 * level / (1 + slope)
+    usual = depth_error(tilted, level, mask, align="offset" if camera is None else "scale")
+    assert depth_error(tilted, level, mask, align="rigid", camera=camera) < 0.01 * usual
+    bumps = 0.1 * np.sin(2 * u) * np.sin(2 * v)
+    found = depth_error(tilted * (1 + bumps / 20), level, mask, align="rigid", camera=camera)
+    assert found == pytest.approx(np.abs(bumps).mean(), rel=0.05)
+
+
 def test_depth_error_aligns_each_part() -> None:
     truth = np.arange(15.0).reshape(3, 5)
     mask = np.ones((3, 5), bool)
@@ -424,8 +440,8 @@ def test_errors_of_depth(function: Callable) -> None:
 
 
 def test_errors_of_depth_error() -> None:
-    with pytest.raises(ValueError, match='"align" must be "offset" or "scale", got "rigid"'):
-        depth_error(UP[..., 2], UP[..., 2], MASK, align="rigid")
+    with pytest.raises(ValueError, match='"align" must be "offset", "scale" or "rigid", got "turn"'):
+        depth_error(UP[..., 2], UP[..., 2], MASK, align="turn")
     with pytest.raises(ValueError, match="must be positive"):
         depth_error(UP[..., 0], UP[..., 2], MASK, align="scale")
 

@@ -82,6 +82,32 @@ def test_data_sets_are_read_as_written(tmp_path: Path, near: bool) -> None:
     assert dataset.extent(tmp_path / "set") == data.values.shape[:2]
 
 
+def test_lights_at_a_distance(tmp_path: Path) -> None:
+    """In a plane; where the object is, in their directions and as bright as at infinity. Elsewhere they are not."""
+    data = dataclasses.replace(small(), camera=small(near=True).camera, distance=10.0)
+    dataset.write(tmp_path, data)
+    (tmp_path / "light_distance.txt").write_text("20  # millimetres")
+    near = dataset.read(tmp_path)
+    rows, columns = np.nonzero(data.mask)
+    middle = 10 * np.array([columns.mean() - 3.2, 2.4 - rows.mean(), -50]) / 50
+    positions = np.array([led.position for led in near.lights])
+    np.testing.assert_allclose(positions[:, 2], 10, rtol=1e-6)
+    np.testing.assert_allclose(unit(positions - middle), data.lights, atol=1e-6)
+    raw = lambda d: d.values * d.intensities
+    np.testing.assert_allclose(raw(near), raw(data), rtol=1e-5)
+    points = np.tile(middle, (len(data.values), 1))
+    points[1] += (2, 0, 0)
+    directions, irradiance = DirectModel(near, LAMBERT, points=points).lighting()
+    np.testing.assert_allclose(directions[0], data.lights, atol=1e-6)
+    # What a surface there reflects of an LED of intensity 1 is to `near.values` as of a distant one to `data.values`
+    np.testing.assert_allclose(data.values[0] * irradiance[0, :, None], near.values[0], rtol=1e-5)
+    assert not np.allclose(directions[1], directions[0], atol=0.01)
+    dataset.write(tmp_path / "again", near)
+    again = dataset.read(tmp_path / "again")
+    np.testing.assert_allclose([led.position for led in again.lights], positions, rtol=1e-6)
+    np.testing.assert_allclose(again.values, near.values, rtol=1e-5)
+
+
 def test_some_of_the_images(tmp_path: Path) -> None:
     """Evenly from the list, with their lights."""
     data = small()
@@ -188,6 +214,9 @@ THREE = "0 0 1\n" * 3
         (without("distance.txt"), True, "ps: lights at finite distance need the distance .* write it to distance.txt"),
         (without("K.txt"), True, "ps: lights at finite distance need a camera; write its matrix to K.txt"),
         (replaced("leds.csv", "x,y,z\n1,2,3"), True, "leds.csv, line 1: the columns must be"),
+        (replaced("light_distance.txt", "2"), False, "ps: near lights need K.txt and distance.txt, which tell where"),
+        (replaced("light_distance.txt", "2"), True, "ps: lights are near already"),
+        (replaced("light_distance.txt", "-2"), False, "or their distance, -2.0, is not positive"),
     ],
 )
 def test_errors_of_folders(tmp_path: Path, change: Callable[[Path], None], near: bool, message: str) -> None:

@@ -16,18 +16,19 @@ from tqdm import tqdm
 from rimlight.inverse.targets import read_picture, srgb_to_linear
 from rimlight.leds import Led, read_leds, write_leds
 
-from .integration import check_camera
+from .integration import check_camera, ray_matrix
 
 #: Of linear sRGB; those with which published results on DiLiGenT weigh the channels.
 LUMINANCE = np.array([0.2989, 0.5870, 0.1140], np.float32)
 
-DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE = (
+DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
     "light_directions.txt",
     "light_intensities.txt",
     "filenames.txt",
     "leds.csv",
     "K.txt",
     "distance.txt",
+    "light_distance.txt",
 )
 
 
@@ -95,6 +96,31 @@ class Dataset:
         """(P, K)"""
         return self.values @ LUMINANCE
 
+    def with_near_lights(self, away: float) -> Dataset:
+        """The data set with its lights at a finite distance: LEDs in a plane across the axis of the camera, in their
+        directions from the middle of the object, the mean of its pixels. They shine as brightly in all directions, and
+        there as brightly as the distant lights.
+
+        away : of the plane from the middle, along the axis, in the unit of `distance`.
+
+        Raises
+        ------
+        ValueError : lights are near already, or not on the camera's side; there is no camera or distance.
+        """
+        if self.near or not 0 < away < np.inf:
+            raise ValueError(f"ps: lights are near already, or their distance, {away}, is not positive")
+        if (behind := self.lights[:, 2] <= 0).any():
+            raise ValueError(f"ps: light {int(behind.argmax()) + 1} is not in a plane on the side of the camera")
+        if self.camera is None or self.distance is None:
+            raise ValueError(f"ps: near lights need {CAMERA} and {DISTANCE}, which tell where the object is")
+        rows, columns = np.nonzero(self.mask)
+        middle = self.distance * ray_matrix(self.camera) @ (columns.mean(), rows.mean(), 1)
+        offsets = self.lights * (away / self.lights[:, 2:])
+        leds = tuple(Led(tuple(middle + o), tuple(-o), 0.0, (1.0, 1.0, 1.0)) for o in offsets)
+        squared = (offsets**2).sum(1)[:, None]
+        values = (self.values / squared).astype(np.float32)
+        return replace(self, lights=leds, intensities=self.intensities * squared, values=values)
+
     def at(self, size: float) -> Dataset:
         """The data set with images of another size: means over those of its pixels that lie in the mask.
 
@@ -161,7 +187,8 @@ def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def read(folder: Path, *, images: int = 0) -> Dataset:
     """Read a folder as DiLiGenT's (Shi et al. 2019): `filenames.txt` (else all pictures but the mask, by name),
     `light_directions.txt` or `leds.csv`, `light_intensities.txt` (default 1), `mask.png`; if there, `K.txt` (3 x 3,
-    else orthographic), `distance.txt` (see `Dataset.distance`), and `Normal_gt.mat` or `Normal_gt.exr`.
+    else orthographic), `distance.txt` (see `Dataset.distance`), `light_distance.txt` (see `Dataset.with_near_lights`),
+    and `Normal_gt.mat` or `Normal_gt.exr`.
 
     Pictures are EXR, PNG, which is taken to be linear as DiLiGenT's are, or JPEG, which is decoded from sRGB.
 
@@ -201,7 +228,9 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
         values[:, k] = read_pixels(folder / name, mask) / intensities[k]
     camera = read_camera(folder)
     distance = _numbers(folder / DISTANCE, 1)[0, 0] if (folder / DISTANCE).is_file() else None
-    return Dataset(values, mask, lights, intensities, camera, _truth(folder, mask), tuple(names), distance)
+    data = Dataset(values, mask, lights, intensities, camera, _truth(folder, mask), tuple(names), distance)
+    away = folder / LIGHT_DISTANCE
+    return data.with_near_lights(_numbers(away, 1)[0, 0]) if away.is_file() else data
 
 
 def write(folder: Path, data: Dataset) -> None:

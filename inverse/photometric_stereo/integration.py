@@ -27,6 +27,7 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sp
 from scipy.ndimage import label
+from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from . import laplacian
@@ -289,14 +290,21 @@ def mesh_of(
 
 
 def depth_error(
-    depth: np.ndarray, truth: np.ndarray, mask: np.ndarray, *, align: Literal["offset", "scale"] = "offset"
+    depth: np.ndarray,
+    truth: np.ndarray,
+    mask: np.ndarray,
+    *,
+    align: Literal["offset", "scale", "rigid"] = "offset",
+    camera: np.ndarray | None = None,
 ) -> float:
     """Mean absolute error of depth after alignment, in the unit of `truth`.
 
     depth, truth : (H, W). mask : (H, W), bool.
     align : what normals do not tell, of each connected part of the mask, is chosen such that the error is least: an
         offset (the median of the differences) for an orthographic camera; a factor (the median of the quotients,
-        weighted by depth) for a perspective one. Never both.
+        weighted by depth) for a perspective one. Never both. "rigid" also rotates and moves the points that the whole
+        mask shows, such that squared distances to those of the truth, pixel by pixel, are least (Umeyama 1991).
+    camera : as of `integrate`, of a rigid alignment.
 
     Raises
     ------
@@ -304,10 +312,17 @@ def depth_error(
         positive; there is no such alignment.
     """
     mask = _checked_mask("depth_error", mask)
-    if align not in ("offset", "scale"):
-        raise ValueError(f'depth_error: "align" must be "offset" or "scale", got "{align}"')
+    if align not in ("offset", "scale", "rigid"):
+        raise ValueError(f'depth_error: "align" must be "offset", "scale" or "rigid", got "{align}"')
     for a in (depth, truth):
-        _check_depth("depth_error", a, mask, positive=align == "scale")
+        _check_depth("depth_error", a, mask, positive=align == "scale" or camera is not None)
+    if align == "rigid":
+        check_camera("depth_error", camera)
+        found, true = (_points(a, mask, camera, 1.0) for a in (depth, truth))
+        found, true = (points - points.mean(0) for points in (found, true))
+        turned = Rotation.align_vectors(true, found)[0].apply(found)
+        scale = 1.0 if camera is None else np.sum(turned * true) / np.sum(turned**2)
+        return float(np.abs(scale * turned - true)[:, 2].mean())
     parts, count = label(mask)
     total = 0.0
     for part in range(1, count + 1):
