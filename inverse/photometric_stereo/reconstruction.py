@@ -128,7 +128,7 @@ def reconstruct(
     rng = np.random.default_rng(options.seed)
     scale = _scale(data.at(options.resolutions[0]), options)
     result: Result | None = None
-    coarse = 1
+    coarse, rendering = 1, None
     bar = tqdm(total=sum(options.iterations) + options.descent.steps, desc="ps", disable=not progress)
 
     def record(size: float, residual: float) -> None:
@@ -146,6 +146,7 @@ def reconstruct(
         level = data.at(size)
         level = dataclasses.replace(level, values=level.values * np.float32(scale))
         counts = (least_squares.ranks(level.luminance) >= options.dark).astype(np.float32)
+        del rendering  # and so its BSDF: see `Rendering`
         rendering = Rendering(level, lobes, max_depth=options.max_depth)
         model = DirectModel(level, lobes, counts=counts)
         if result is None:
@@ -182,8 +183,9 @@ def reconstruct(
             result.depth = depth
             record(size, residual)
 
-        counted = counts if options.descent.depth_rate else seen
+        counted = np.ones_like(counts) if options.descent.depth_rate else seen
         if options.descent.lights:
+            del rendering
             rendering = Rendering(level, lobes, max_depth=options.max_depth, lights=options.descent.lights)
         descend(
             rendering,

@@ -18,7 +18,7 @@ from .dataset import Dataset, unit
 from .descent import ExponentiatedGradient, NormalAdam
 from .direct import HUBER, DirectModel, Guess
 from .integration import normals_of
-from .rendering import Rendering
+from .rendering import Domain, Rendering
 
 log = logging.getLogger(__name__)
 
@@ -79,14 +79,8 @@ def descend(
     counts : (P, K), how much values count. With `depth_rate`, those in shadow should, too: they tell of depth.
     after : called after each step with depth and the root mean square residual over the median value. Derivatives that
         are not finite are left out, and logged.
-
-    Raises
-    ------
-    ValueError : depth shall descend, and the camera is not orthographic.
     """
     P, K, _ = data.values.shape
-    if options.depth_rate and data.camera is not None:
-        raise ValueError("ps: depth descends under orthographic cameras only; set descent.depth_rate to 0")
     scale, B = DirectModel(data, rendering.lobes).scale, len(guess.weights)
     normals, bsdf = NormalAdam(P, options.rate), ExponentiatedGradient(3, options.bsdf_rate)
     lack = np.maximum(1 - guess.weights.sum(0), 0)
@@ -114,41 +108,54 @@ def descend(
         guess.weights = bsdf.step(guess.weights, g["weights"], factor)
         if options.depth_rate > 0:
             # What normals say of depth is stiff. In its own metric, an offset descends smoothly.
-            change = _smoothed(rendering, g["depth"])
+            change = _smoothed(rendering.domain, depth, g["depth"])
             square = MEMORY * square + (1 - MEMORY) * float(np.mean(change**2))
             size = np.sqrt(square / (1 - MEMORY ** (i + 1)))
             offset -= options.depth_rate * factor / (size or 1.0) * change
             offset -= offset.mean()
-        depth = rendering.domain.integrate(guess.normals, bilateral) + offset
+        depth = _moved(rendering.domain, rendering.domain.integrate(guess.normals, bilateral), offset)
         if options.depth_rate > 0 and options.integrability > 0:
-            of_depth = _normals(rendering, depth)
+            of_depth = _normals(rendering.domain, depth)
             guess.normals = unit(guess.normals + options.integrability * (of_depth - guess.normals))
-            offset = depth - rendering.domain.integrate(guess.normals, bilateral)
+            integrated = rendering.domain.integrate(guess.normals, bilateral)
+            offset = _in_pixels(rendering.domain, depth) - _in_pixels(rendering.domain, integrated)
         if after is not None:
             total = max(float(counted.sum()), 1.0)
             after(depth, float(np.sqrt((counted * residual**2).sum() / total / 3) / scale))
     return depth
 
 
-def _normals(rendering: Rendering, depth: np.ndarray) -> np.ndarray:
+def _in_pixels(domain: Domain, depth: np.ndarray) -> np.ndarray:
+    """Depth of which a difference is one in pixels; with a camera, its logarithm in those of the focal length."""
+    return depth if domain.camera is None else np.log(depth) * domain.camera[0, 0]
+
+
+def _moved(domain: Domain, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    return depth + pixels if domain.camera is None else depth * np.exp(pixels / domain.camera[0, 0])
+
+
+def _normals(domain: Domain, depth: np.ndarray) -> np.ndarray:
     """Of depth, (P, 3)."""
-    domain = rendering.domain
     wide = np.full(domain.wide.shape, np.nan)
     wide[domain.wide] = depth
     return normals_of(wide, domain.wide, camera=domain.camera)[domain.wide][domain.inner]
 
 
-def _smoothed(rendering: Rendering, gradient: np.ndarray) -> np.ndarray:
-    """A gradient with respect to depth in the metric of slopes: (L + small)⁻¹ g, with the Laplacian L of the pixels."""
-    wide = rendering.domain.wide
-    number = np.full(wide.shape, -1)
-    number[wide] = np.arange(wide.sum())
+def _smoothed(domain: Domain, depth: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """A gradient with respect to depth in the metric of slopes, in pixels: (L + small)⁻¹ g, with the Laplacian L of the
+    pixels. Where depth is steep, neighbours count less: what is in front of something else moves as a whole."""
+    number = np.full(domain.wide.shape, -1)
+    number[domain.wide] = np.arange(len(depth))
     pairs = np.concatenate(
         [np.stack([a.ravel(), b.ravel()]) for a, b in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))], 1
     )
     first, second = pairs[:, (pairs >= 0).all(0)]
-    count = len(gradient)
-    degree = np.bincount(np.r_[first, second], minlength=count) + 1e-4
-    i = np.arange(count)
-    entries = np.r_[degree, np.full(2 * len(first), -1.0)], (np.r_[i, first, second], np.r_[i, second, first])
-    return laplacian.solve(sp.csr_matrix(entries), gradient, np.zeros(count), tolerance=1e-4)
+    if domain.camera is not None:
+        gradient = gradient * depth / domain.camera[0, 0]
+    height = _in_pixels(domain, depth)
+    stiffness = 1 / (1 + (height[first] - height[second]) ** 2)
+    count, i = len(depth), np.arange(len(depth))
+    total = lambda pixel: np.bincount(pixel, stiffness, count)
+    entries = np.r_[total(first) + total(second) + 1e-4, -stiffness, -stiffness]
+    A = sp.csr_matrix((entries, (np.r_[i, first, second], np.r_[i, second, first])))
+    return laplacian.solve(A, gradient, np.zeros(count), tolerance=1e-4)

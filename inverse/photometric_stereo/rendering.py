@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -69,6 +71,9 @@ class Domain:
 class Rendering:
     """Renders the images of a data set from a guess and a depth.
 
+    One at a time: with the BSDFs of several, whose scale is that of their mesh, Dr.Jit 1.5 aborts ("invalid redefinition
+    of function"). What became garbage is collected first.
+
     max_depth : longest path: 2 is direct light, 3 adds one interreflection.
     lights : number of lights that are rendered at a time, the first ones until others are chosen. 0: all.
 
@@ -79,6 +84,7 @@ class Rendering:
     """
 
     def __init__(self, data: Dataset, lobes: ggx.Lobes, *, max_depth: int = 3, lights: int = 0):
+        gc.collect()
         if not 0 <= lights <= len(data.lights) or (lights and data.near):
             raise ValueError(
                 f"ps: cannot render {lights} of {len(data.lights)} lights at a time"
@@ -98,13 +104,16 @@ class Rendering:
         params.update()
         self.scene = mi.load_dict({"type": "scene", "object": mesh, "sensor": self._sensor(), **self._lights()})
         self.params = mi.traverse(self.scene)
-        self.key = lambda name: next(k for k in self.params.keys() if k.endswith(name))  # noqa: SIM118
         # The camera sees points that move along its rays: no edge moves on the film
         rig = {"type": "rig", "rr_depth": 99, "sppp": 0}
         self.integrators = {d: mi.load_dict({**rig, "max_depth": d}) for d in {2, max_depth}}
         self.fixed_shadows = mi.load_dict({**rig, "max_depth": max_depth, "sppi": 0})
 
     # ---------------------- Scene ----------------------
+
+    def key(self, name: str) -> str:
+        """Of a parameter that ends so."""
+        return next(k for k in self.params.keys() if k.endswith(name))  # noqa: SIM118
 
     def _sensor(self) -> dict:
         H, W = self.data.mask.shape
