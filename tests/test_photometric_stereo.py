@@ -1076,15 +1076,35 @@ def test_descent_refuses_what_it_cannot() -> None:
         refinement.Descent(rate=float("nan"))
     scene = bowl(K=4, spread=30)
     camera = np.array([[400.0, 0, 12], [0, 400, 12], [0, 0, 1]])
-    moved = dataclasses.replace(scene.data, camera=camera)
-    counts, rng = np.ones(scene.data.values.shape[:2]), np.random.default_rng(0)
-    run = lambda data, options: refinement.descend(
-        scene.rendering, data, deepcopy(scene.guess), scene.depth, counts, options, rng
-    )
-    with pytest.raises(ValueError, match="depth descends under orthographic cameras only"):
-        run(moved, refinement.Descent(steps=1, depth_rate=0.1))
     with pytest.raises(ValueError, match="pixels are not square"):
         Rendering(dataclasses.replace(scene.data, camera=camera * [[1], [1.2], [1]]), scene.rendering.lobes)
+
+
+@pytest.mark.parametrize("focal", [0, 400], ids=["orthographic", "perspective"])
+def test_heights_of_steps_follow_from_their_shadows(focal: int) -> None:
+    """Normals do not tell them. A plateau, in depth; with a camera, from far away."""
+    N, true, start = 24, 6.0, 3.0
+    lights = unit(spiral(6, 45) + np.array([0.3, 0, 0]))
+    flat = lambda x, y: (0 * x, 0.0, 0.0)
+    scene = height_field(LAMBERT, np.full((1, 3), 0.5), lights, flat, N=N, mask=np.ones((N, N), bool))
+    camera = np.array([[focal, 0, 11.5], [0, focal, 11.5], [0, 0, 1.0]]) if focal else None
+    data = dataclasses.replace(scene.data, camera=camera, distance=focal or None)
+    rendering = Rendering(data, LAMBERT, max_depth=2)
+    v, u = np.nonzero(rendering.domain.wide)
+    high = (np.abs(u - 12.5) < 5) & (np.abs(v - 12.5) < 5)
+    raised = lambda height: focal * np.exp(-height * high / focal) if focal else height * high
+    height = lambda d: (-1 if focal else 1) * (d[high].mean() - d[~high].mean())
+    rendering.update(scene.guess, raised(true))
+    data = dataclasses.replace(data, values=rendering.image(spp=64, seed=1))
+    options = refinement.Descent(steps=25, spp=4, rate=0, bsdf_rate=0, depth_rate=0.3, integrability=0)
+    counts = np.ones(data.values.shape[:2], np.float32)
+    found: list[float] = []
+    refinement.descend(
+        rendering, data, deepcopy(scene.guess), raised(start), counts, options, np.random.default_rng(0),
+        after=lambda depth, _: found.append(height(depth)),
+    )  # fmt: skip
+    print(np.round(found, 2))
+    assert found[0] < 4 and found[-1] == pytest.approx(true, abs=0.5)
 
 
 def test_derivatives_that_are_not_finite_are_reported(monkeypatch: pytest.MonkeyPatch, caplog) -> None:

@@ -85,7 +85,9 @@ def descend(
     normals, bsdf = NormalAdam(P, options.rate), ExponentiatedGradient(3, options.bsdf_rate)
     lack = np.maximum(1 - guess.weights.sum(0), 0)
     guess.weights = (1 - SPREAD) * guess.weights + SPREAD * np.minimum(lack, guess.weights.sum(0)) / B
-    offset, square = np.zeros_like(depth), 0.0
+    domain, square = rendering.domain, 0.0
+    integrated = lambda: domain.integrate(guess.normals, bilateral)
+    offset = _in_pixels(domain, depth) - _in_pixels(domain, integrated())
     seed = lambda: int(rng.integers(2**31))
     for i in range(options.steps):
         factor = 0.1 ** (i / max(options.steps - 1, 1))
@@ -108,17 +110,16 @@ def descend(
         guess.weights = bsdf.step(guess.weights, g["weights"], factor)
         if options.depth_rate > 0:
             # What normals say of depth is stiff. In its own metric, an offset descends smoothly.
-            change = _smoothed(rendering.domain, depth, g["depth"])
+            change = _smoothed(domain, depth, g["depth"])
             square = MEMORY * square + (1 - MEMORY) * float(np.mean(change**2))
             size = np.sqrt(square / (1 - MEMORY ** (i + 1)))
             offset -= options.depth_rate * factor / (size or 1.0) * change
             offset -= offset.mean()
-        depth = _moved(rendering.domain, rendering.domain.integrate(guess.normals, bilateral), offset)
+        depth = _moved(domain, integrated(), offset)
         if options.depth_rate > 0 and options.integrability > 0:
-            of_depth = _normals(rendering.domain, depth)
+            of_depth = _normals(domain, depth)
             guess.normals = unit(guess.normals + options.integrability * (of_depth - guess.normals))
-            integrated = rendering.domain.integrate(guess.normals, bilateral)
-            offset = _in_pixels(rendering.domain, depth) - _in_pixels(rendering.domain, integrated)
+            offset = _in_pixels(domain, depth) - _in_pixels(domain, integrated())
         if after is not None:
             total = max(float(counted.sum()), 1.0)
             after(depth, float(np.sqrt((counted * residual**2).sum() / total / 3) / scale))
