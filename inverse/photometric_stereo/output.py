@@ -52,7 +52,9 @@ def write_numbers(
     data, guess = result.data, result.guess
     unit = "pixels, towards the camera, mean 0"
     if data.camera is not None:
-        unit = "along the axis, " + ("unknown unit, geometric mean 1" if data.distance is None else "unit of the LEDs")
+        unit = "along the axis, " + (
+            "unknown unit, geometric mean 1" if data.distance is None else "unit of distance.txt"
+        )
     write_exr(folder / "normals.exr", {"": data.image(guess.normals)}, {"axes": "x right, y up, z towards the camera"})
     write_exr(folder / "depth.exr", {"": data.image(depth(result))[..., None]}, {"unit": unit})
     write_exr(folder / "albedo.exr", {"": data.image(guess.albedo)[..., None]}, {"unit": "of bsdf.json"})

@@ -174,10 +174,7 @@ def _rendered(view: View, result: Result, options: Options) -> list[str]:
 
 def _render(view: View, result: Result, options: Options, data: Dataset, guess: Guess) -> np.ndarray:
     rendering = Rendering(data, result.lobes, max_depth=options.max_depth)
-    depth = rendering.domain.integrate(guess.normals, options.bilateral)
-    if data.camera is not None:  # normals do not tell the scale
-        depth *= np.exp(np.mean(np.log(view.depth / depth[rendering.domain.inner])))
-    rendering.update(guess, depth)
+    rendering.update(guess, view.depth[rendering.domain.nearest])
     return rendering.image(spp=SPP, seed=options.seed)
 
 
