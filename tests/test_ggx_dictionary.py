@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdfs import chi_squared, context, direction, interaction, random_directions, random_numbers, vector
 
 from rimlight import ggx
 
@@ -44,44 +45,6 @@ def random_weights(lobes: ggx.Lobes = LOBES, seed: int = 0) -> np.ndarray:
 
 def one_lobe(alpha: float, eta: float, weight: float = 1.0) -> mi.BSDF:
     return mi.load_dict(material(np.full((1, 1), weight), ggx.Lobes((alpha,), (eta,))))
-
-
-def context(component: int | None = None) -> mi.BSDFContext:
-    result = mi.BSDFContext()
-    if component is not None:
-        result.component = component
-    return result
-
-
-def direction(theta, phi=0.0) -> np.ndarray:
-    """Degrees -> (3, N)."""
-    theta, phi = np.broadcast_arrays(np.radians(theta), np.radians(phi))
-    return np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]).reshape(3, -1)
-
-
-def vector(directions: np.ndarray) -> mi.Vector3f:
-    return mi.Vector3f(np.float32(directions))
-
-
-def interaction(wi: np.ndarray) -> mi.SurfaceInteraction3f:
-    si = dr.zeros(mi.SurfaceInteraction3f, wi.shape[1])
-    si.wi = vector(wi)
-    return si
-
-
-def random_numbers(count: int) -> tuple[mi.Float, mi.Point2f]:
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, count)
-    return sampler.next_1d(), sampler.next_2d()
-
-
-def random_directions(count: int = 4096, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs above the surface, half of them near to mirrors of each other: (3, N) each; exact in single precision."""
-    rng = np.random.default_rng(seed)
-    wi, wo = (direction(rng.uniform(0, 89.5, count), rng.uniform(0, 360, count)) for _ in range(2))
-    near = wi * [[-1], [-1], [1]] + rng.normal(0, 0.1, (3, count)) * rng.uniform(0, 1, count) ** 3
-    wo = np.where(np.arange(count) % 2, near * np.sign(near[2]), wo)
-    return tuple(np.float32(w / np.linalg.norm(w, axis=0)).astype(float) for w in (wi, wo))
 
 
 def model(alpha, eta, wi, wo) -> np.ndarray:
@@ -293,20 +256,6 @@ def test_weights_that_are_no_numbers_show():
 
 
 # ---------------------- Sampling ----------------------
-
-
-def chi_squared(bsdf, angle: float, component: int | None = None, other=None) -> mi.chi2.ChiSquareTest:
-    """Of the samples of `bsdf` against the density of `other`, by default its own."""
-    wi = direction(angle)
-    repeated = lambda count: interaction(np.broadcast_to(wi, (3, count)))
-
-    def draw(numbers):
-        si = repeated(dr.width(numbers))
-        bs, _ = bsdf.sample(context(component), si, numbers[0], mi.Point2f(numbers[1], numbers[2]))
-        return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
-
-    density = lambda wo: (other or bsdf).pdf(context(component), repeated(dr.width(wo)), wo)
-    return mi.chi2.ChiSquareTest(mi.chi2.SphericalDomain(), draw, density, 3, 200_000, res=101, ires=16)
 
 
 @pytest.mark.parametrize(
