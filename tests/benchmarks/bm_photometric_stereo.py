@@ -88,8 +88,10 @@ MASK = {"shape": str(FACE), "crop": (0.22, 0.355, 0.78, 0.66, 0.74)}
 #: Name -> options of the simulation.
 SIMULATED = {
     "bowl, dark-blue-paint": {"shape": "bowl", "bsdf": BLUE},
-    "bowl, diffuse 0.7": {"shape": "bowl", "bsdf": "diffuse:0.7,0.7,0.7"},
+    "bowl, gray-plastic": {"shape": "bowl", "bsdf": GREY},
+    "bowl, diffuse 0.7": {"shape": "bowl", "bsdf": "diffuse:0.7,0.7,0.7", "spp": 512},
     "convex mask, gray-plastic": {**MASK, "bsdf": GREY},
+    "concave mask, gray-plastic": {**MASK, "concave": True, "bsdf": GREY},
     "concave mask, dark-blue-paint": {**MASK, "concave": True, "bsdf": BLUE},
 }
 
@@ -500,7 +502,7 @@ if __name__ == "__main__":
                 "bear, parts": DILIGENT / "bearPNG",
                 **{name: FACE for name in SIMULATED if "mask" in name},
                 "shadows": FACE,
-                "bowl, dark-blue-paint": TABLES,
+                **{f"bowl, {name}": TABLES for name in (BLUE, GREY)},
             },
         )
     )
