@@ -165,7 +165,13 @@ def reconstruct(
                 # The mean of the last ones: less noise, and as the surface hardly changes, hardly older
                 new = rendering.indirect(spp=options.spp, seed=int(rng.integers(2**31)))
                 _smooth(new, level.mask, options.smoothing)
-                indirect = new if indirect is None else indirect + (new - indirect) * max(1 / (i + 1), AVERAGED)
+                if indirect is None:
+                    indirect = new
+                else:
+                    new -= indirect
+                    new *= max(1 / (i + 1), AVERAGED)
+                    indirect += new
+                del new
             seen = counts * rendering.visible(model) if options.shadows else counts
             points = rendering.domain.points(result.depth)
             model = DirectModel(level, lobes, points=points, counts=seen, indirect=indirect)

@@ -199,7 +199,9 @@ class Rendering:
 
     def indirect(self, *, spp: int, seed: int) -> np.ndarray:
         """Of `image`, what has been reflected more than once: (P, K, 3). Equal seeds make the rest cancel."""
-        return self.image(spp=spp, seed=seed) - self.image(spp=spp, seed=seed, max_depth=2)
+        found = self.image(spp=spp, seed=seed)
+        found -= self.image(spp=spp, seed=seed, max_depth=2)  # in place: these are the largest arrays of all
+        return found
 
     def gradient(
         self, adjoint: np.ndarray, *, spp: int, seed: int, depth: bool = False, adaptive: bool = False
