@@ -197,8 +197,12 @@ THREE = "0 0 1\n" * 3
         (without("K.txt"), True, "ps: lights at finite distance need a camera; write its matrix to K.txt"),
         (replaced("leds.csv", "x,y,z\n1,2,3"), True, "leds.csv, line 1: the columns must be"),
         (replaced("light_distance.txt", "2"), False, "ps: near lights need K.txt and distance.txt, which tell where"),
-        (replaced("light_distance.txt", "2"), True, "ps: lights are near already"),
-        (replaced("light_distance.txt", "-2"), False, "or their distance, -2.0, is not positive"),
+        (replaced("light_distance.txt", "2"), True, "ps: lights have positions already; take leds.csv"),
+        (
+            replaced("light_distance.txt", "-2"),
+            False,
+            "light_distance.txt: the distance of the lights must be positive, got -2",
+        ),
     ],
 )
 def test_errors_of_folders(tmp_path: Path, change: Callable[[Path], None], near: bool, message: str) -> None:

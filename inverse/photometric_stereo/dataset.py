@@ -107,10 +107,14 @@ class Dataset:
         ------
         ValueError : lights are near already, or not on the camera's side; there is no camera or distance.
         """
-        if self.near or not 0 < away < np.inf:
-            raise ValueError(f"ps: lights are near already, or their distance, {away}, is not positive")
+        if self.near:
+            raise ValueError(f"ps: lights have positions already; take {LEDS} or {LIGHT_DISTANCE} away")
+        if not 0 < away < np.inf:
+            raise ValueError(f"ps: {LIGHT_DISTANCE}: the distance of the lights must be positive, got {away}")
         if (behind := self.lights[:, 2] <= 0).any():
-            raise ValueError(f"ps: light {int(behind.argmax()) + 1} is not in a plane on the side of the camera")
+            raise ValueError(
+                f"ps: light {int(behind.argmax()) + 1} does not shine from the side of the camera; describe it in {LEDS}"
+            )
         if self.camera is None or self.distance is None:
             raise ValueError(f"ps: near lights need {CAMERA} and {DISTANCE}, which tell where the object is")
         rows, columns = np.nonzero(self.mask)

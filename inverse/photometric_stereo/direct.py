@@ -188,7 +188,7 @@ class DirectModel:
         raised = lambda x: x * DAMPING + 1e-12
         M = mi.Matrix3f([[raised(uu), uv, ua], [uv, raised(vv), va], [ua, va, raised(aa)]])
         x = dr.rcp(M) @ mi.Vector3f(bu, bv, ba)
-        x = dr.select(dr.all(dr.isfinite(x)), x, 0)
+        x = dr.select(dr.all(dr.isfinite(x)), x, 0)  # no value of the pixel counts: it stays as it is
         length = dr.hypot(x.x, x.y)
         x *= dr.minimum(1, LONGEST / dr.maximum(length, 1e-20))
         n = dr.normalize(n + x.x * frame.s + x.y * frame.t)
