@@ -113,7 +113,7 @@ class Dataset:
             raise ValueError(f"ps: {LIGHT_DISTANCE}: the distance of the lights must be positive, got {away}")
         if (behind := self.lights[:, 2] <= 0).any():
             raise ValueError(
-                f"ps: light {int(behind.argmax()) + 1} does not shine from the side of the camera; describe it in {LEDS}"
+                f"ps: light {int(behind.argmax()) + 1} is not on the side of the camera; describe it in {LEDS}"
             )
         if self.camera is None or self.distance is None:
             raise ValueError(f"ps: near lights need {CAMERA} and {DISTANCE}, which tell where the object is")
