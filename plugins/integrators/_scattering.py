@@ -227,7 +227,8 @@ class Scattering:
         if self.moving:
             geometry *= self._area(pi, ray, active)
         now = dr.detach(geometry)
-        return y, ω, dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
+        relative = dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
+        return y, ω, dr.select(grazes(y, ω, active), dr.detach(relative), relative)
 
     def _area(self, pi, ray, active):
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
@@ -250,10 +251,15 @@ class Scattering:
         return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
 
 
-#: Cosine below which a surface that is no mesh is taken to stand still, as a fixed ray meets it. Where a curved one is
-#: met moves as 1 / cos, and single precision does not know cosines of 1e-4: single samples would outweigh all others.
-#: The loss is of this order, relative to what the surface itself contributes.
+#: Cosine below which a surface that is no mesh is taken to stand still. Where a fixed ray meets a curved one, and the
+#: solid angle that an element of it covers, change as 1 / cos; single precision does not know cosines of 1e-4, and
+#: single samples would outweigh all others. The loss is of this order, relative to what the surface itself contributes.
 GRAZING = 1e-3
+
+
+def grazes(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+    """Is a curved surface met almost along a tangent?"""
+    return active & ~si.shape.is_mesh() & (dr.abs_dot(dr.detach(si.n), dr.detach(direction)) < GRAZING)
 
 
 def met_by(
@@ -263,8 +269,7 @@ def met_by(
     with dr.resume_grad(when=attached):
         si = pi.compute_surface_interaction(ray, flags, active)
         if attached:
-            grazing = active & ~pi.shape.is_mesh() & (dr.abs_dot(dr.detach(si.n), dr.detach(ray.d)) < GRAZING)
-            si = dr.select(grazing, dr.detach(si), si)
+            si = dr.select(grazes(si, ray.d, active), dr.detach(si), si)
         return si
 
 
