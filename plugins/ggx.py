@@ -1,7 +1,7 @@
-"""Dictionaries of fixed lobes, GGX and Lambertian: their formulas, and the files that hold them with their weights.
+"""Dictionaries of fixed lobes, GGX and diffuse: their formulas, and the files that hold them with their weights.
 
 A file is JSON: ``{"alpha": [0.1, null], "eta": [1.5, null], "weights": [[r, g, b], [r, g, b]]}``, an entry for each
-lobe; null marks the Lambertian one. `rimlight.inverse.reflectance` makes such files, the plugin ``ggx_dictionary``
+lobe; null marks diffuse ones, see `Lobes`. `rimlight.inverse.reflectance` makes such files, the plugin ``ggx_dictionary``
 reads them::
 
     lobes, weights = ggx.read("weights.json")
@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +33,17 @@ GRAZING = 1e-6
 
 @dataclass(frozen=True)
 class Lobes:
-    """The lobes of a dictionary. NaN in both marks a Lambertian lobe of albedo 1.
+    """The lobes of a dictionary. Without alpha (NaN) a lobe is diffuse: Lambertian, of albedo 1, if it has no eta
+    either; else under a smooth coat.
 
     Raises
     ------
     ValueError : there are none; as many of one as of the other are not given; a number is out of its range.
     """
 
-    #: Roughness of the GGX distribution, in (0, 1].
+    #: Roughness of the GGX distribution, in (0, 1], or NaN.
     alpha: tuple[float, ...]
-    #: Index of refraction, above 1.
+    #: Index of refraction, above 1, or NaN.
     eta: tuple[float, ...]
 
     def __post_init__(self):
@@ -50,9 +52,10 @@ class Lobes:
                 f'"alpha" and "eta" must have a number for each lobe, got {len(self.alpha)} and {len(self.eta)}'
             )
         for i, (alpha, eta) in enumerate(zip(self.alpha, self.eta, strict=True), 1):
-            if not (np.isnan(alpha) and np.isnan(eta)) and not (0 < alpha <= 1 and 1 < eta < np.inf):
+            if not ((np.isnan(alpha) or 0 < alpha <= 1) and 1 < eta < np.inf or np.isnan(alpha) and np.isnan(eta)):
                 raise ValueError(
-                    f"lobe {i}: expected alpha in (0, 1] and eta > 1, or neither (Lambertian), got {alpha} and {eta}"
+                    f"lobe {i}: expected alpha in (0, 1] and eta > 1, or eta alone (diffuse, under a coat), or neither "
+                    f"(Lambertian), got {alpha} and {eta}"
                 )
 
     def __len__(self) -> int:
@@ -67,9 +70,10 @@ class Lobes:
 
     @property
     def normal_reflectance(self) -> np.ndarray:
-        """Fresnel's at normal incidence, (B,); 1 for a Lambertian lobe."""
-        eta = np.array(self.eta)
-        return np.where(np.isnan(eta), 1, np.square((eta - 1) / (eta + 1)))
+        """What each reflects at normal incidence, (B,): GGX lobes as much as smooth surfaces would."""
+        alpha, eta = np.array(self.alpha), np.array(self.eta)
+        F = np.square((eta - 1) / (eta + 1))
+        return np.where(np.isnan(eta), 1, np.where(np.isnan(alpha), 1 - F, F))
 
 
 # ---------------------- The model ----------------------
@@ -90,7 +94,8 @@ def terms(lobes: Lobes, wi: Any, wo: Any) -> Iterator[tuple[float, Any, list[tup
     F = {eta: fresnel(eta, c) for eta in dict.fromkeys(lobes.eta) if not np.isnan(eta)}
     for alpha, members in lobes.groups():
         if np.isnan(alpha):
-            yield alpha, type(c)(dr.inv_pi), [(i, 1) for i, _ in members]
+            within = lambda eta: 1 if np.isnan(eta) else coated(eta, cos_i, cos_o)
+            yield alpha, type(c)(dr.inv_pi), [(i, within(eta)) for i, eta in members]
             continue
         a2 = alpha * alpha
         t = dr.fma(cos2, a2, sin2)  # (n·h)² (α² - 1) + 1, without its cancellation near the normal
@@ -122,6 +127,20 @@ def fresnel(eta: float, c: Any) -> Any:
     # Cook and Torrance 1982, with one common denominator
     p, q = s * dr.fma(s, c, -1), dr.fma(c, k, s)
     return 0.5 * dr.square(k * dr.rcp(dr.square(s) * q)) * dr.fma(p, p, dr.square(q))
+
+
+def coated(eta: float, cos_i: Any, cos_o: Any) -> Any:
+    """π times a diffuse lobe under a smooth coat, which lets 1 - F in and out: of the light, 1 - F(cos θᵢ) is reflected
+    in all (Shirley et al. 1997, with Fresnel's term instead of Schlick's)."""
+    return (1 - fresnel(eta, cos_i)) * (1 - fresnel(eta, cos_o)) * (1 / (1 - mean_fresnel(eta)))
+
+
+@cache
+def mean_fresnel(eta: float) -> float:
+    """Reflectance of a smooth surface in light from everywhere, 2 ∫ F(c) c dc."""
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    cos = 0.5 * (nodes + 1)
+    return sum(w * c * fresnel(eta, c) for w, c in zip(weights.tolist(), cos.tolist(), strict=True))
 
 
 def reflected_density(a2: Any, wi: Any, wo: Any) -> Any:

@@ -16,7 +16,7 @@ def glossy(lobes: ggx.Lobes) -> np.ndarray:
     """Weights, (B, 3): plastic, coloured."""
     alpha = np.array(lobes.alpha)
     weights = np.zeros((len(lobes), 3))
-    weights[np.isnan(alpha)] = (0.5, 0.35, 0.2)
+    weights[np.isnan(lobes.eta)] = (0.5, 0.35, 0.2)
     weights[np.nanargmin(np.abs(alpha - 0.25))] = 0.4
     return weights
 

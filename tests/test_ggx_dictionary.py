@@ -11,15 +11,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bsdfs import chi_squared, context, direction, interaction, random_directions, random_numbers, vector
+from scipy import integrate
 
 from rimlight import ggx
 
 NAN = float("nan")
 ALPHAS = [0.003, 0.01, 0.05, 0.2, 0.5, 1.0]
 ETAS = [1.05, 1.5, 20.0]
-LOBES = ggx.Lobes((*np.repeat(ALPHAS, 3).tolist(), NAN), (*ETAS * len(ALPHAS), NAN))
+LOBES = ggx.Lobes((*np.repeat(ALPHAS, 3).tolist(), NAN, NAN, NAN), (*ETAS * len(ALPHAS), 1.5, 4.0, NAN))
 SMOOTH = ggx.Lobes((0.1, 0.2, NAN), (1.5, 3.0, NAN))
-ROUGH = ggx.Lobes((0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0, NAN), (1.5,) * 7 + (NAN,))
+ROUGH = ggx.Lobes((0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0, NAN, NAN), (1.5,) * 8 + (NAN,))
 GLOSSY, DIFFUSE = 0, 1
 
 
@@ -48,17 +49,24 @@ def one_lobe(alpha: float, eta: float, weight: float = 1.0) -> mi.BSDF:
 
 
 def model(alpha, eta, wi, wo) -> np.ndarray:
-    """A lobe as in section 3.4 of Bangaru 2019, in double precision; complex arguments give derivatives."""
-    if np.isnan(alpha):
+    """A lobe as in section 3.4 of Bangaru 2019, or a diffuse one, in double precision; complex arguments give
+    derivatives."""
+    if np.isnan(eta):
         return 0 * wi[2] + 1 / np.pi
+    if np.isnan(alpha):
+        mean, _ = integrate.quad(lambda c: 2 * c * fresnel(eta, c), 0, 1, epsabs=1e-12)
+        return (1 - fresnel(eta, wi[2])) * (1 - fresnel(eta, wo[2])) / (np.pi * (1 - mean))
     h = wi + wo
     h = h / np.sqrt((h * h).sum(0))
     nl, nv, c = wi[2], wo[2], (wi * h).sum(0)
     D = alpha**2 / (np.pi * (h[2] ** 2 * (alpha**2 - 1) + 1) ** 2)
     G1 = lambda nv: 2 * nv / (nv + np.sqrt(alpha**2 + (1 - alpha**2) * nv**2))
+    return D * fresnel(eta, c) * G1(nl) * G1(nv) / (4 * nl * nv)
+
+
+def fresnel(eta: float, c):
     g = np.sqrt(eta**2 + c**2 - 1)
-    F = 0.5 * ((g - c) / (g + c)) ** 2 * (1 + (((g + c) * c - 1) / ((g - c) * c + 1)) ** 2)
-    return D * F * G1(nl) * G1(nv) / (4 * nl * nv)
+    return 0.5 * ((g - c) / (g + c)) ** 2 * (1 + (((g + c) * c - 1) / ((g - c) * c + 1)) ** 2)
 
 
 # ---------------------- The model ----------------------
@@ -190,6 +198,9 @@ def test_no_more_light_than_came():
             largest = max(largest, mean)
     assert largest > 0.98
     assert albedo(one_lobe(NAN, NAN), 50.0)[0] == pytest.approx(1, abs=1e-4)
+    for angle in (0, 50, 85):
+        mean, error = albedo(one_lobe(NAN, 1.5), angle)
+        assert abs(mean - (1 - fresnel(1.5, np.cos(np.radians(angle))))) < 4 * error + 1e-4
 
 
 def test_albedo_by_quadrature():
@@ -269,7 +280,8 @@ def test_samples_have_their_density(lobes, angle, component):
 
 def test_the_wrong_density_is_noticed():
     weights = random_weights(ROUGH)
-    bsdf, other = (mi.load_dict(material(w, ROUGH)) for w in (weights, weights[::-1]))
+    glossy = weights * ~np.isnan(ROUGH.alpha)[:, None]
+    bsdf, other = (mi.load_dict(material(w, ROUGH)) for w in (weights, glossy))
     assert not chi_squared(bsdf, 45.0, other=other).run(quiet=True)
 
 
@@ -322,10 +334,10 @@ def test_parameters():
     assert list(params.keys()) == ["weights"] and params.flags("weights") == mi.ParamFlags.Differentiable
     np.testing.assert_allclose(np.array(params["weights"]), weights, rtol=1e-6)
     reflectance = np.array(bsdf.eval_diffuse_reflectance(interaction(direction(0.0))))
-    np.testing.assert_allclose(reflectance[:, 0], weights[-1], rtol=1e-6)
-    assert "19 lobes" in str(bsdf)
+    np.testing.assert_allclose(reflectance[:, 0], weights[-3:].sum(0), rtol=1e-6)
+    assert "21 lobes" in str(bsdf)
     params["weights"] = mi.TensorXf(mi.Float([1.0]), shape=(1, 1))
-    with pytest.raises(ValueError, match=re.escape('"weights" must keep its shape (19, 3), got (1, 1)')):
+    with pytest.raises(ValueError, match=re.escape('"weights" must keep its shape (21, 3), got (1, 1)')):
         params.update()
 
 
@@ -340,7 +352,7 @@ def test_scale():
     np.testing.assert_allclose(value(half), 0.5 * value(plain), rtol=1e-5)
     np.testing.assert_allclose(value(mixed), 0.5 * value(plain), rtol=1e-5)
     at = interaction(wi)
-    assert half.eval_diffuse_reflectance(at)[0][0] == pytest.approx(0.5 * random_weights()[-1, 0])
+    assert half.eval_diffuse_reflectance(at)[0][0] == pytest.approx(0.5 * random_weights()[-3:, 0].sum())
     assert np.array_equal(half.pdf(context(), at, vector(wo)), plain.pdf(context(), at, vector(wo)))
     varying = mi.BSDFFlags.SpatiallyVarying
     assert mixed.flags() & varying and mixed.flags(GLOSSY) & varying and not half.flags() & varying
@@ -406,7 +418,7 @@ W = np.full((3, 3), 0.3)
         ({"weights": W * NAN}, '"weights" must be finite'),
         ({"weights": W + 0.04}, '"weights" must sum to at most 1 for each colour, got 1.02'),
         ({"weights": "many"}, '"weights" must be numbers'),
-        ({"weights": W, "alpha": [0.0, 0.2, NAN]}, "lobe 1: expected alpha in (0, 1] and eta > 1, or neither"),
+        ({"weights": W, "alpha": [0.0, 0.2, NAN]}, "lobe 1: expected alpha in (0, 1] and eta > 1, or eta"),
         ({"weights": W, "alpha": [0.1, 0.2, 0.3]}, "lobe 3: expected alpha in (0, 1]"),
         ({"weights": W, "eta": [1.5, 1.0, NAN]}, "lobe 2: expected alpha in (0, 1] and eta > 1"),
         ({"weights": W, "eta": [1.5, 2.0]}, '"alpha" and "eta" must have a number for each lobe, got 3 and 2'),

@@ -203,7 +203,7 @@ def test_bsdf_is_found_with_known_normals(plastic: Scene) -> None:
     """Its values, not its weights: several sums of lobes are alike."""
     model, guess = plastic.model(), deepcopy(plastic.guess)
     guess.weights = np.zeros_like(guess.weights)
-    guess.weights[np.isnan(plastic.rendering.lobes.alpha)] = 0.3
+    guess.weights[np.isnan(plastic.rendering.lobes.eta)] = 0.3
     error = lambda: np.abs(model.predicted(guess) - plastic.data.values).mean() / plastic.data.values.mean()
     assert error() > 0.2
     rng = np.random.default_rng(0)

@@ -112,9 +112,11 @@ def test_jacobian():
 
 def test_candidates():
     lobes = reflectance.candidates((0.01, 0.46), (1.05, 1.95), (30, 20))
-    assert len(lobes) == 601 and np.isnan(lobes.alpha[-1])
-    assert (lobes.alpha[0], lobes.alpha[-2]) == (0.01, 0.46) and (lobes.eta[0], lobes.eta[-2]) == (1.05, 1.95)
-    assert len(reflectance.candidates(counts=(3, 2), lambertian=False)) == 6
+    assert len(lobes) == 602
+    np.testing.assert_array_equal(lobes.alpha[-2:], [NAN, NAN])
+    np.testing.assert_array_equal(lobes.eta[-2:], [1.5, NAN])
+    assert (lobes.alpha[0], lobes.alpha[-3]) == (0.01, 0.46) and (lobes.eta[0], lobes.eta[-3]) == (1.05, 1.95)
+    assert len(reflectance.candidates(counts=(3, 2), diffuse=False)) == 6
 
 
 # ---------------------- Reduction ----------------------
@@ -123,7 +125,7 @@ def test_candidates():
 def test_reduction_finds_the_lobes_of_the_tables():
     """Four lobes of a few hundred, and the Lambertian one."""
     grid = reflectance.candidates((0.01, 1.0), (1.1, 20.0), (20, 12))
-    true = [3 * 12 + 4, 11 * 12 + 4, 11 * 12 + 9, 17 * 12 + 9, 240]
+    true = [3 * 12 + 4, 11 * 12 + 4, 11 * 12 + 9, 17 * 12 + 9, 241]
     lobes = ggx.Lobes(*([column[i] for i in true] for column in (grid.alpha, grid.eta)))
     weights = {f"material {i}": random_weights(lobes, seed=i) for i in range(4)}
     tables = ((name, table_of(lobes, w)) for name, w in weights.items())

@@ -243,7 +243,7 @@ def _start(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options
     albedo = np.linalg.norm(solve(values / exposures, directions), axis=1)
     weights = np.zeros((len(lobes), 3))
     colour = (data.values / exposures[:, None]).mean((0, 1)) / (data.luminance / exposures).mean()
-    weights[np.isnan(lobes.alpha)] = np.minimum(np.pi * np.median(albedo) * colour, 1)
+    weights[np.isnan(lobes.eta)] = np.minimum(np.pi * np.median(albedo) * colour, 1)
     return Guess(normals, np.ones(len(values)), exposures, weights)
 
 

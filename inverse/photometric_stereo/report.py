@@ -234,7 +234,7 @@ def _reflectance(view: View, result: Result) -> str:
     rows = []
     order = np.argsort(-weights.max(1))
     for b in order[weights.max(1)[order] > 1e-4]:
-        lobe = "Lambertian" if np.isnan(result.lobes.alpha[b]) else f"{result.lobes.alpha[b]:.3g}"
+        lobe = "diffuse" if np.isnan(result.lobes.alpha[b]) else f"{result.lobes.alpha[b]:.3g}"
         rows.append((lobe, f"{result.lobes.eta[b]:.3g}", *(f"{w:.4f}" for w in weights[b])))
     note = "" if factor == 1 else f" times {number(factor)}"
     albedo = _with_scale({"Albedo": view.guess.albedo}, view.image, f"factor of the BSDF{note}")

@@ -34,6 +34,9 @@ SUBSET = np.ix_(np.arange(90), np.arange(1, 90, 3), np.arange(5, 180, 13))
 #: Numbers that thousands of lobes, which are much alike, are reduced to in a fit. It is exact to about 0.00001.
 RANK = 100
 
+#: Index of refraction of the coat of diffuse candidates, on which fits hardly depend: that of glass and resins.
+COAT = 1.5
+
 #: In each round of the reduction at most this part is removed.
 REMOVED = 0.1
 
@@ -51,9 +54,10 @@ def candidates(
     alpha: tuple[float, float] = (0.003, 1.0),
     eta: tuple[float, float] = (1.05, 100.0),
     counts: tuple[int, int] = (50, 40),
-    lambertian: bool = True,
+    diffuse: bool = True,
 ) -> ggx.Lobes:
-    """A grid of lobes to choose from, and a Lambertian one. The steps grow with alpha and eta - 1.
+    """A grid of lobes to choose from, and two diffuse ones, under a coat and Lambertian. The steps grow with alpha and
+    eta - 1.
 
     alpha, eta : smallest and largest.
     counts : of different alphas and etas.
@@ -61,7 +65,7 @@ def candidates(
     alphas = np.geomspace(*alpha, counts[0])
     etas = 1 + np.geomspace(eta[0] - 1, eta[1] - 1, counts[1])
     grid = [(float(f"{a:.3g}"), float(f"{e:.4g}")) for a in alphas for e in etas]
-    return ggx.Lobes(*zip(*grid, *[(np.nan, np.nan)] * lambertian, strict=True))
+    return ggx.Lobes(*zip(*grid, *[(np.nan, COAT), (np.nan, np.nan)][: 2 * diffuse], strict=True))
 
 
 def fit(table: np.ndarray, lobes: ggx.Lobes) -> np.ndarray:
@@ -128,7 +132,8 @@ def reduce(
     del design
     systems = [_compressed(basis, y) for three in bar(values.values(), "prepare") for y in three]
 
-    alpha, eta = np.array(lobes.alpha), np.array(lobes.eta)
+    alpha = np.array(lobes.alpha)
+    eta = np.where(np.isnan(alpha), np.nan, lobes.eta)  # of GGX lobes only
     kept = np.arange(len(lobes))
     while len(kept) > count:
         fits = bar(systems, f"fit {len(kept)} lobes")
@@ -139,7 +144,7 @@ def reduce(
         if both.all():
             both = np.isin(kept, _most_useful(kept, usefulness, count))
         kept = kept[both]
-    reduced = ggx.Lobes(tuple(alpha[kept].tolist()), tuple(eta[kept].tolist()))
+    reduced = ggx.Lobes(*(tuple(np.array(numbers)[kept].tolist()) for numbers in (lobes.alpha, lobes.eta)))
     design = _design(reduced)
     weights = {name: _fit(y, design) for name, y in bar(values.items(), "fit")}
     return reduced, weights, {name: _error(y, design, weights[name]) for name, y in values.items()}

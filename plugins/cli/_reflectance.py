@@ -62,8 +62,8 @@ class Reduce:
     """Smallest and largest eta to choose from."""
     candidates: tuple[int, int] = (50, 40)
     """Alphas and etas to choose from."""
-    lambertian: bool = True
-    """Choose from these and a Lambertian lobe?"""
+    diffuse: bool = True
+    """Choose from these and diffuse lobes, Lambertian and under a coat?"""
 
     def run(self) -> int:
         at_least(1, lobes=self.lobes, alphas=self.alphas, etas=self.etas, candidates=min(self.candidates))
@@ -72,7 +72,7 @@ class Reduce:
         if not paths:
             raise InputError(f'there are no files *.binary in "{self.folder}"')
         with expected(ValueError):
-            candidates = reflectance.candidates(self.alpha_range, self.eta_range, self.candidates, self.lambertian)
+            candidates = reflectance.candidates(self.alpha_range, self.eta_range, self.candidates, self.diffuse)
         with expected(ValueError, OSError, pattern=REFUSAL):
             lobes, weights, errors = reflectance.reduce(
                 ((path.stem, merl_tables.read_merl(path)) for path in paths),
