@@ -52,7 +52,7 @@ class Lobes:
                 f'"alpha" and "eta" must have a number for each lobe, got {len(self.alpha)} and {len(self.eta)}'
             )
         for i, (alpha, eta) in enumerate(zip(self.alpha, self.eta, strict=True), 1):
-            if not ((np.isnan(alpha) or 0 < alpha <= 1) and 1 < eta < np.inf or np.isnan(alpha) and np.isnan(eta)):
+            if not (((np.isnan(alpha) or 0 < alpha <= 1) and 1 < eta < np.inf) or (np.isnan(alpha) and np.isnan(eta))):
                 raise ValueError(
                     f"lobe {i}: expected alpha in (0, 1] and eta > 1, or eta alone (diffuse, under a coat), or neither "
                     f"(Lambertian), got {alpha} and {eta}"

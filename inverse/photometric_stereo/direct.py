@@ -31,6 +31,10 @@ LONGEST, DAMPING, ALBEDOS = 0.2, 1.02, (0.02, 20.0)
 #: Residuals count fully up to this part of the median value of the data set.
 HUBER = 0.05
 
+#: Of what the squares would be without it, a diffuse lobe under a coat must leave at most this. It is much like a
+#: Lambertian one on normals that lean a little: otherwise it would be taken for all sorts of small errors.
+EVIDENCE = 0.85
+
 #: Pixels from which the BSDF is found; and by how much the diagonal of its equations is raised.
 SAMPLED, RIDGE = 2000, 1e-6
 
@@ -201,44 +205,86 @@ class DirectModel:
 
     # ---------------------- BSDF ----------------------
 
-    def fit_bsdf(self, guess: Guess, rng: np.random.Generator) -> None:
-        """Weights of the dictionary by non-negative least squares with a sum of at most 1, in place."""
+    def fit_bsdf(self, guess: Guess, rng: np.random.Generator, *, coat: bool = True) -> None:
+        """Weights of the dictionary by non-negative least squares with a sum of at most 1, in place.
+
+        coat : may diffuse light be that under a coat, if there is evidence?
+
+        Normals lean to make up for a wrong BSDF, and the BSDF for wrong normals. So it is found as it would be if the
+        normals followed: what turns of them explain is left out (variable projection, Golub and Pereyra 1973).
+        """
         pixels = rng.choice(self.P, min(SAMPLED, self.P), replace=False)
+        count, B = len(pixels), len(self.lobes)
         p, k = self._pairs(pixels)
         point = dr.gather(mi.Point3f, self.points, p)
-        frame = mi.Frame3f(dr.gather(mi.Vector3f, own(guess.normals), p))
+        normal, view = dr.gather(mi.Vector3f, own(guess.normals), p), self.view(point)
         direction, irradiance = self.light(k, point)
-        wo = frame.to_local(direction)
-        scale = dr.gather(mi.Float, own(guess.albedo), p) * dr.gather(mi.Float, own(guess.exposures), k)
-        scale *= irradiance * dr.maximum(wo.z, 0)
-        design = np.array([f * scale for f in ggx.lobes(self.lobes, frame.to_local(self.view(point)), wo)]).T
+        scale = dr.gather(mi.Float, own(guess.albedo), p) * dr.gather(mi.Float, own(guess.exposures), k) * irradiance
+
+        def design(n: mi.Vector3f) -> np.ndarray:
+            frame = mi.Frame3f(n)
+            wo = frame.to_local(direction)
+            factor = scale * dr.maximum(wo.z, 0)
+            return np.array([f * factor for f in ggx.lobes(self.lobes, frame.to_local(view), wo)], np.float64).T
+
+        frame = mi.Frame3f(normal)
+        D = design(normal)  # (count K, B)
         entry = p * self.K + k
         values, counts = dr.gather(mi.Color3f, self.values, entry), dr.gather(mi.Float, self.counts, entry)
         if self.indirect is not None:
             values -= dr.gather(mi.Color3f, self.indirect, entry)
-        values, counts = np.array(values, np.float64), np.array(counts, np.float64)
-        residual = values - (design @ guess.weights).T
-        counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(residual, axis=0), 1e-20))
-        weighted = design * counts[:, None]
-        gram = weighted.T @ design
-        for c in range(guess.weights.shape[1]):
-            guess.weights[:, c] = simplex_least_squares(gram, weighted.T @ values[c])
+        values, counts = np.array(values, np.float64).T, np.array(counts, np.float64)
+        residual = values - D @ guess.weights
+        counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(residual, axis=1), 1e-20))
+        per_pixel = lambda a: a.reshape(count, self.K, *a.shape[1:])
+        weighted = D * counts[:, None]
+        # By turns of the normals: (count, K, colours, 2)
+        turned = [(design(dr.normalize(normal + TURN * t)) - D) @ guess.weights / TURN for t in (frame.s, frame.t)]
+        N = per_pixel(np.stack(turned, -1))
+        WN = per_pixel(counts)[..., None, None] * N
+        NN = np.einsum("pkci,pkcj->pij", WN, N)
+        NN[:, [0, 1], [0, 1]] *= DAMPING
+        NN += 1e-12 * self.scale**2 * np.eye(2)
+        colours = values.shape[1]
+        DN = np.stack([np.swapaxes(per_pixel(D), 1, 2) @ WN[:, :, c] for c in range(colours)], 1)  # (count, c, B, 2)
+        DN = DN.reshape(count, colours * B, 2)
+        explained = np.linalg.solve(NN, np.swapaxes(DN, 1, 2))  # (count, 2, c B)
+        gram = np.kron(np.eye(colours), weighted.T @ D) - np.tensordot(DN, explained, ((0, 2), (0, 1)))
+        VN = np.einsum("pkci,pkc->pi", WN, per_pixel(values))
+        moments = (weighted.T @ values).T.ravel() - np.einsum("pi,pij->j", VN, explained)
+        squares = (counts[:, None] * values**2).sum() - (VN * np.linalg.solve(NN, VN[..., None])[..., 0]).sum()
+
+        def solved(wanted: np.ndarray) -> tuple[float, np.ndarray]:
+            """What is left of the squares, and weights, with these lobes."""
+            i, x = np.flatnonzero(np.tile(wanted, colours)), np.zeros(colours * B)
+            x[i] = simplex_least_squares(gram[np.ix_(i, i)], moments[i], colours)
+            return squares + x @ gram @ x - 2 * moments @ x, x.reshape(colours, B).T
+
+        alpha, eta = np.array(self.lobes.alpha), np.array(self.lobes.eta)
+        coated = np.isnan(alpha) & ~np.isnan(eta)
+        left, guess.weights = solved(~coated)
+        if coat and coated.any():
+            with_coat, weights = solved(~np.zeros_like(coated))
+            if with_coat < EVIDENCE * left:
+                guess.weights = weights
 
 
-def simplex_least_squares(gram: np.ndarray, moments: np.ndarray) -> np.ndarray:
-    """Non-negative x, (B,), with a sum of at most 1, that minimises `x @ gram @ x - 2 moments @ x`, slightly
-    regularised.
+def simplex_least_squares(gram: np.ndarray, moments: np.ndarray, colours: int = 1) -> np.ndarray:
+    """Non-negative x, (colours B,), that minimises `x @ gram @ x - 2 moments @ x`, slightly regularised, while each of
+    `colours` equal parts of it sums to at most 1.
 
-    gram : (B, B), positive semidefinite. moments : (B,).
+    gram : (colours B, colours B), positive semidefinite. moments : (colours B,).
     """
-    B = len(moments)
     size = np.sqrt(np.diag(gram)) + 1e-30
-    root = np.linalg.cholesky(gram / size / size[:, None] + RIDGE * np.eye(B)).T * size
+    root = np.linalg.cholesky(gram / size / size[:, None] + RIDGE * np.eye(len(moments))).T * size
     target = np.linalg.solve(root.T, moments)
-    # A black lobe takes what is left of 1
+    # A black lobe of each colour takes what is left of 1
     heavy = 1e3 * np.linalg.norm(target) + 1e-30
-    x, _ = nnls(np.block([[root, np.zeros((B, 1))], [np.full((1, B + 1), heavy)]]), np.append(target, heavy))
-    return x[:-1] / max(x[:-1].sum(), 1)
+    sums = np.kron(np.eye(colours), np.full((1, len(moments) // colours), heavy))
+    A = np.block([[root, np.zeros((len(moments), colours))], [sums, heavy * np.eye(colours)]])
+    x, _ = nnls(A, np.append(target, np.full(colours, heavy)), maxiter=20 * A.shape[1])
+    x = x[: len(moments)].reshape(colours, -1)
+    return (x / np.maximum(x.sum(1, keepdims=True), 1)).ravel()
 
 
 def bsdf_of(lobes: ggx.Lobes, weights: np.ndarray, scale: str | None = None) -> mi.BSDF:

@@ -28,6 +28,15 @@ from .rendering import Domain, Rendering
 #: Share of the newest interreflections in their running mean.
 AVERAGED = 0.25
 
+#: Exposures that seem to be off by less (logarithm) are taken as stated: shapes and BSDFs explain so much as well.
+STATED = 0.02
+
+#: Alternations before a coat is thought of: with the normals of the start, anything may look like one.
+SETTLED = 3
+
+#: Fits of the BSDF and of normals in turns, in each alternation: rendering takes longer.
+INNER = 3
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -175,8 +184,9 @@ def reconstruct(
             seen = counts * rendering.visible(model) if options.shadows else counts
             points = rendering.domain.points(result.depth)
             model = DirectModel(level, lobes, points=points, counts=seen, indirect=indirect)
-            model.fit_bsdf(guess, rng)
-            model.fit_normals(guess, free_albedo=options.albedo)
+            for _ in range(INNER):
+                model.fit_bsdf(guess, rng, coat=len(result.history) >= SETTLED)
+                model.fit_normals(guess, steps=2, free_albedo=options.albedo)
             residual = _exposures(model, guess, level, seen, rng, options)
             result.depth = rendering.domain.integrate(guess.normals, options.bilateral)
             turned = float(angles(before, guess.normals).mean())
@@ -259,6 +269,7 @@ def _exposures(model, guess, data, counts, rng, options) -> float:
         guess.exposures *= calibration.exposures(
             data.luminance[pixels], predicted @ LUMINANCE, w, model.mean_directions()
         )
+        guess.exposures[np.abs(np.log(guess.exposures)) < STATED] = 1
     return float(residual)
 
 
