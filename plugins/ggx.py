@@ -1,8 +1,8 @@
 """Dictionaries of fixed lobes, GGX and diffuse: their formulas, and the files that hold them with their weights.
 
 A file is JSON: ``{"alpha": [0.1, null], "eta": [1.5, null], "weights": [[r, g, b], [r, g, b]]}``, an entry for each
-lobe; null marks diffuse ones, see `Lobes`. `rimlight.inverse.reflectance` makes such files, the plugin ``ggx_dictionary``
-reads them::
+lobe; null marks diffuse ones, see `Lobes`. `rimlight.inverse.reflectance` makes such files, the plugin
+``ggx_dictionary`` reads them::
 
     lobes, weights = ggx.read("weights.json")
     f = ggx.lobes(lobes, wi, wo)  # of each lobe

@@ -213,6 +213,45 @@ def test_bsdf_is_found_with_known_normals(plastic: Scene) -> None:
     assert guess.weights.min() >= 0 and guess.weights.sum(0).max() <= 1 + 1e-6
 
 
+def leaning(normals: np.ndarray) -> np.ndarray:
+    """Outwards, by up to 3 degrees."""
+    return unit(normals + 0.06 * normals * [1, 1, 0])
+
+
+def test_bsdf_is_found_while_normals_follow(plastic: Scene) -> None:
+    """From normals that lean, it is right for those that do not."""
+    model, guess = plastic.model(), deepcopy(plastic.guess)
+    guess.normals = leaning(guess.normals)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        model.fit_bsdf(guess, rng)
+    of_truth = dataclasses.replace(guess, normals=plastic.guess.normals)
+    error = np.abs(model.predicted(of_truth) - plastic.data.values).mean() / plastic.data.values.mean()
+    assert error < 0.002  # 0.0065 for normals that are held
+
+
+@pytest.mark.parametrize("coat", [True, False])
+def test_coat_needs_evidence(plastic: Scene, coat: bool) -> None:
+    """It is taken where light is diffuse under a coat, not for the normals of the start."""
+    lobes = plastic.rendering.lobes
+    coated = np.isnan(lobes.alpha) & ~np.isnan(lobes.eta)
+    truth = deepcopy(plastic.guess)
+    if coat:
+        truth.weights[np.isnan(lobes.eta)] = 0
+        truth.weights[coated] = (0.5, 0.35, 0.2)
+    values = plastic.model().predicted(truth).astype(np.float32)
+    model = plastic._replace(data=dataclasses.replace(plastic.data, values=values)).model()
+    guess, rng = deepcopy(truth), np.random.default_rng(0)
+    guess.weights = glossy(lobes)
+    guess.normals = leaning(guess.normals)
+    for i in range(8):
+        model.fit_bsdf(guess, rng, coat=i >= 3)
+        model.fit_normals(guess)
+    found = guess.weights[coated].sum(0)
+    assert (found > 0.15).all() if coat else (found == 0).all()
+    assert angles(guess.normals, truth.normals).mean() < 0.3
+
+
 def test_lighting() -> None:
     """Directions and irradiance of LEDs, by their formula; of lights at infinity."""
     scene = near_ball(LAMBERT, np.full((1, 3), 0.5), 1000.0)

@@ -1,4 +1,4 @@
-"""Plugin `ggx_dictionary`: a weighted sum of fixed GGX lobes and a Lambertian one, differentiable in its weights."""
+"""Plugin `ggx_dictionary`: a weighted sum of fixed GGX lobes and diffuse ones, differentiable in its weights."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ GLOSSY, DIFFUSE = 0, 1
 #: Samples are for at most so many different alphas, which stand for those near to them.
 SAMPLED_ALPHAS = 5
 
-#: Share of the samples that is spread evenly over these alphas and the Lambertian lobe: what weighs nothing as yet has
-#: a derivative, too.
+#: Share of the samples that is spread evenly over these alphas and the diffuse lobes: what weighs nothing as yet has a
+#: derivative, too.
 EVEN = 0.1
 
 
@@ -39,8 +39,9 @@ class GGXDictionaryBSDF(mi.BSDF):
 
      * - alpha, eta
        - |tensor|
-       - Roughness of the lobes, in (0, 1], and their index of refraction, above 1: ``mi.Float`` of B numbers each. NaN
-         in both marks a Lambertian lobe of albedo 1. (Default: the dictionary of the package)
+       - Roughness of the lobes, in (0, 1], and their index of refraction, above 1: ``mi.Float`` of B numbers each. A
+         lobe without alpha (NaN) is diffuse: Lambertian, of albedo 1, without eta either, else under a smooth coat.
+         (Default: the dictionary of the package)
 
      * - filename
        - |string|
@@ -65,7 +66,7 @@ class GGXDictionaryBSDF(mi.BSDF):
        f(\omega_i, \omega_o) = \sum_{b=1}^B \theta_b\, f_b(\omega_i, \omega_o), \qquad
        \theta_b \ge 0, \quad \sum_b \theta_b \le 1.
 
-    A lobe is either Lambertian, :math:`1 / \pi`, or
+    A lobe is Lambertian, :math:`1 / \pi`, or
 
     .. math::
 
@@ -77,14 +78,22 @@ class GGXDictionaryBSDF(mi.BSDF):
                g = \sqrt{\eta^2 + c^2 - 1}
 
     with the half vector :math:`h`: GGX (Walter et al. 2007) with separable shadowing, and the Fresnel term of Cook and
-    Torrance 1982. It is reciprocal, and no lobe reflects more than it receives. It is differentiable with respect to
-    `weights`, `scale`, and the directions and normals.
+    Torrance 1982. Or it is diffuse under a smooth coat,
+
+    .. math::
+
+       f_b = \frac{(1 - F(\cos\theta_i))\, (1 - F(\cos\theta_o))}{\pi\, (1 - \bar F)}, \qquad
+       \bar F = 2 \int_0^1 F(c)\, c\, dc,
+
+    and reflects :math:`1 - F(\cos\theta_i)` (Shirley et al. 1997, with this Fresnel term). All of them are reciprocal,
+    and reflect no more than they receive. They are differentiable with respect to `weights`, `scale`, and the
+    directions and normals.
 
     **Cost.** Lobes that share their ``alpha`` share :math:`D` and :math:`G`, and those that share their ``eta`` share
     :math:`F`. The 40 lobes of the package, with 12 and 8 different ones, take half of the time of 40 others, and three
     times that of 4, see :doc:`/performance`. Lobes are part of the compiled kernel; the weights are not.
 
-    **Sampling.** A lobe in proportion to what it reflects at this angle: the Lambertian one by its cosine, the others
+    **Sampling.** A lobe in proportion to what it reflects at this angle: diffuse ones by the cosine, the others
     by the visible normals (Dupuy and Benyoub 2023) of the nearest of five alphas. A tenth of the samples is spread
     evenly. Samples and their densities carry no gradients.
 
@@ -133,7 +142,7 @@ class GGXDictionaryBSDF(mi.BSDF):
         # In Dr.Jit's own memory: `dr.freeze` does not go with NumPy's
         self.weights = mi.TensorXf(mi.Float(weights.ravel().tolist()), shape=weights.shape)
         self._alphas, nearest = _few_alphas(self.lobes)
-        #: For each lobe, the entry of `_shares` to which it adds: its alpha's, or behind them the Lambertian one's.
+        #: For each lobe, the entry of `_shares` to which it adds: its alpha's, or behind them the diffuse ones'.
         self._entry = mi.UInt32(nearest)
         self._normal_reflectance = mi.Float(self.lobes.normal_reflectance.tolist())
         flags = mi.BSDFFlags
@@ -159,7 +168,7 @@ class GGXDictionaryBSDF(mi.BSDF):
             grey = dr.mean(dr.abs(dr.unravel(mi.UnpolarizedSpectrum, dr.detach(self.weights.array))))
             grey = dr.select(dr.isfinite(grey), grey, 0)
             count = len(self._alphas) + 1
-            #: What each alpha's lobes, and the Lambertian one, reflect at normal incidence; then the same at grazing.
+            #: What each alpha's lobes, and the diffuse ones, reflect at normal incidence; then the same at grazing.
             self._shares = dr.zeros(mi.Float, 2 * count)
             dr.scatter_add(self._shares, grey * self._normal_reflectance, self._entry)
             dr.scatter_add(self._shares, grey, self._entry + count)
@@ -219,7 +228,7 @@ class GGXDictionaryBSDF(mi.BSDF):
         return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
     def eval_diffuse_reflectance(self, si, active=True):
-        """Of the Lambertian lobes."""
+        """Of the diffuse lobes."""
         result = mi.UnpolarizedSpectrum(0)
         for i in np.flatnonzero(np.isnan(self.lobes.alpha)).tolist():
             result += dr.gather(mi.UnpolarizedSpectrum, self.weights.array, dr.full(mi.UInt32, i, dr.width(si.wi)))
@@ -228,7 +237,7 @@ class GGXDictionaryBSDF(mi.BSDF):
         return dr.select(active, result, 0)
 
     def _probabilities(self, ctx: mi.BSDFContext, wi: mi.Vector3f) -> dict[int, mi.Float]:
-        """With which the alphas, and behind them the Lambertian lobe, are sampled, of those that are wanted."""
+        """With which the alphas, and behind them the diffuse lobes, are sampled, of those that are wanted."""
         glossy, diffuse = _enabled(ctx)
         count = len(self._alphas) + 1
         schlick = dr.power(dr.clip(1 - wi.z, 0, 1), 5)
@@ -249,7 +258,7 @@ class GGXDictionaryBSDF(mi.BSDF):
 
 def _few_alphas(lobes: ggx.Lobes) -> tuple[list[float], list[int]]:
     """At most `SAMPLED_ALPHAS`, from the smallest to the largest; and for each lobe the number of the nearest. A
-    Lambertian lobe has the number behind the last."""
+    diffuse lobe has the number behind the last."""
     alpha = np.log(np.array(lobes.alpha))
     distinct = np.unique(alpha[~np.isnan(alpha)])
     if len(distinct) > SAMPLED_ALPHAS:
@@ -259,7 +268,7 @@ def _few_alphas(lobes: ggx.Lobes) -> tuple[list[float], list[int]]:
 
 
 def _enabled(ctx: mi.BSDFContext) -> tuple[bool, bool]:
-    """Are the glossy lobes and the Lambertian one wanted?"""
+    """Are the glossy lobes and the diffuse ones wanted?"""
     flags = mi.BSDFFlags
     return ctx.is_enabled(flags.GlossyReflection, GLOSSY), ctx.is_enabled(flags.DiffuseReflection, DIFFUSE)
 
