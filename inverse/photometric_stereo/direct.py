@@ -236,23 +236,10 @@ class DirectModel:
         values, counts = np.array(values, np.float64).T, np.array(counts, np.float64)
         residual = values - D @ guess.weights
         counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(residual, axis=1), 1e-20))
-        per_pixel = lambda a: a.reshape(count, self.K, *a.shape[1:])
-        weighted = D * counts[:, None]
-        # By turns of the normals: (count, K, colours, 2)
         turned = [(design(dr.normalize(normal + TURN * t)) - D) @ guess.weights / TURN for t in (frame.s, frame.t)]
-        N = per_pixel(np.stack(turned, -1))
-        WN = per_pixel(counts)[..., None, None] * N
-        NN = np.einsum("pkci,pkcj->pij", WN, N)
-        NN[:, [0, 1], [0, 1]] *= DAMPING
-        NN += 1e-12 * self.scale**2 * np.eye(2)
+        per_pixel = (a.reshape(count, self.K, *a.shape[1:]) for a in (D, np.stack(turned, -1), values, counts))
+        gram, moments, squares = without_turns(*per_pixel)
         colours = values.shape[1]
-        DN = np.stack([np.swapaxes(per_pixel(D), 1, 2) @ WN[:, :, c] for c in range(colours)], 1)  # (count, c, B, 2)
-        DN = DN.reshape(count, colours * B, 2)
-        explained = np.linalg.solve(NN, np.swapaxes(DN, 1, 2))  # (count, 2, c B)
-        gram = np.kron(np.eye(colours), weighted.T @ D) - np.tensordot(DN, explained, ((0, 2), (0, 1)))
-        VN = np.einsum("pkci,pkc->pi", WN, per_pixel(values))
-        moments = (weighted.T @ values).T.ravel() - np.einsum("pi,pij->j", VN, explained)
-        squares = (counts[:, None] * values**2).sum() - (VN * np.linalg.solve(NN, VN[..., None])[..., 0]).sum()
 
         def solved(wanted: np.ndarray) -> tuple[float, np.ndarray]:
             """What is left of the squares, and weights, with these lobes."""
@@ -267,6 +254,33 @@ class DirectModel:
             with_coat, weights = solved(~np.zeros_like(coated))
             if with_coat < EVIDENCE * left:
                 guess.weights = weights
+
+
+def without_turns(
+    lobes: np.ndarray, turns: np.ndarray, values: np.ndarray, counts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Normal equations of weights x, (C B,) for C colours, as if the normals of all pixels followed.
+
+    lobes : (P, K, B). turns : changes of the values as normals turn, (P, K, C, 2). values : (P, K, C). counts : (P, K).
+
+    Returns
+    -------
+    gram, moments, squares : `x @ gram @ x - 2 moments @ x + squares` is what is left of the squares.
+    """
+    (P, _, B), colours = lobes.shape, values.shape[2]
+    weighted = lobes * counts[..., None]
+    counted = turns * counts[..., None, None]
+    A = np.einsum("pkci,pkcj->pij", counted, turns)
+    A[:, [0, 1], [0, 1]] = A[:, [0, 1], [0, 1]] * DAMPING + 1e-20
+    of_lobes = np.stack([np.swapaxes(lobes, 1, 2) @ counted[:, :, c] for c in range(colours)], 1)
+    of_lobes = of_lobes.reshape(P, colours * B, 2)
+    of_values = np.einsum("pkci,pkc->pi", counted, values)
+    explained = np.linalg.solve(A, np.swapaxes(of_lobes, 1, 2))  # (P, 2, C B)
+    gram = np.kron(np.eye(colours), np.tensordot(weighted, lobes, ((0, 1), (0, 1))))
+    gram -= np.tensordot(of_lobes, explained, ((0, 2), (0, 1)))
+    moments = np.tensordot(values, weighted, ((0, 1), (0, 1))).ravel() - np.tensordot(of_values, explained, 2)
+    squares = (counts[..., None] * values**2).sum()
+    return gram, moments, float(squares - (of_values * np.linalg.solve(A, of_values[..., None])[..., 0]).sum())
 
 
 def simplex_least_squares(gram: np.ndarray, moments: np.ndarray, colours: int = 1) -> np.ndarray:
