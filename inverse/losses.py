@@ -5,7 +5,9 @@ picture and the derivative image are rendered with *independent* random numbers.
 image J the mean J̄, then the mean of ∇f(I) · J is the product of the means, which for `l2` and `relative` (whose ∇f is
 linear in I) is the gradient of f(Ī), without bias. Were both made of the same samples, the covariance of I and J would
 be added. ∇f of `l1` is a sign: where the noise of I exceeds its distance from the target, the gradient is weaker than
-that of f(Ī), but of the right direction. For the loss that compares nothing, see `classifier`.
+that of f(Ī), and it vanishes where the *median* of I is at the target, not Ī. The noise of paths is skewed, by few
+samples that are bright, so fits by `l1` with few samples end a little too bright. For the loss that compares nothing,
+see `classifier`.
 """
 
 from __future__ import annotations
