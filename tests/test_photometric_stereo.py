@@ -245,7 +245,7 @@ def test_coat_needs_evidence(plastic: Scene, coat: bool) -> None:
     guess.weights = glossy(lobes)
     guess.normals = leaning(guess.normals)
     for i in range(8):
-        model.fit_bsdf(guess, rng, coat=i >= 3)
+        model.fit_bsdf(guess, rng, coat=None if i >= 3 else False)
         model.fit_normals(guess)
     found = guess.weights[coated].sum(0)
     assert (found > 0.15).all() if coat else (found == 0).all()

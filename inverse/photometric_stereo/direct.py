@@ -33,7 +33,7 @@ HUBER = 0.05
 
 #: Of what the squares would be without it, a diffuse lobe under a coat must leave at most this. It is much like a
 #: Lambertian one on normals that lean a little: otherwise it would be taken for all sorts of small errors.
-EVIDENCE = 0.85
+EVIDENCE = 0.78
 
 #: Pixels from which the BSDF is found; and by how much the diagonal of its equations is raised.
 SAMPLED, RIDGE = 2000, 1e-6
@@ -205,10 +205,10 @@ class DirectModel:
 
     # ---------------------- BSDF ----------------------
 
-    def fit_bsdf(self, guess: Guess, rng: np.random.Generator, *, coat: bool = True) -> None:
+    def fit_bsdf(self, guess: Guess, rng: np.random.Generator, *, coat: bool | None = None) -> None:
         """Weights of the dictionary by non-negative least squares with a sum of at most 1, in place.
 
-        coat : may diffuse light be that under a coat, if there is evidence?
+        coat : may diffuse light be that under a coat? None: if there is evidence.
 
         Normals lean to make up for a wrong BSDF, and the BSDF for wrong normals. So it is found as it would be if the
         normals followed: what turns of them explain is left out (variable projection, Golub and Pereyra 1973).
@@ -250,9 +250,9 @@ class DirectModel:
         alpha, eta = np.array(self.lobes.alpha), np.array(self.lobes.eta)
         coated = np.isnan(alpha) & ~np.isnan(eta)
         left, guess.weights = solved(~coated)
-        if coat and coated.any():
+        if coat is not False and coated.any():
             with_coat, weights = solved(~np.zeros_like(coated))
-            if with_coat < EVIDENCE * left:
+            if coat or with_coat < EVIDENCE * left:
                 guess.weights = weights
 
 

@@ -51,6 +51,8 @@ class Options:
     """Normals at the start."""
     reflectance: bool = True
     """Fit the BSDF. Otherwise the surface is Lambertian, and only its colour is fitted."""
+    coat: bool | None = None
+    """May light be diffuse under a smooth coat, as that of plastics? Default: if there is strong evidence."""
     albedo: bool = True
     """A factor of the BSDF for each pixel."""
     exposures: bool = True
@@ -184,8 +186,9 @@ def reconstruct(
             seen = counts * rendering.visible(model) if options.shadows else counts
             points = rendering.domain.points(result.depth)
             model = DirectModel(level, lobes, points=points, counts=seen, indirect=indirect)
+            coat = False if options.coat is None and len(result.history) < SETTLED else options.coat
             for _ in range(INNER):
-                model.fit_bsdf(guess, rng, coat=len(result.history) >= SETTLED)
+                model.fit_bsdf(guess, rng, coat=coat)
                 model.fit_normals(guess, steps=2, free_albedo=options.albedo)
             residual = _exposures(model, guess, level, seen, rng, options)
             result.depth = rendering.domain.integrate(guess.normals, options.bilateral)

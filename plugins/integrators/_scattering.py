@@ -53,6 +53,7 @@ class Scattering:
         self.several = [e for e in scene.emitters() if hasattr(e, "light_count") and e.sampling_weight() > 0]
         self.any_elsewhere = any(not f & (mi.EmitterFlags.Delta | mi.EmitterFlags.Surface) for f in flags)
         self.moving = [(mi.ShapePtr(s), s.is_mesh()) for s in scene.shapes() if s.parameters_grad_enabled()]
+        self.any_curved = any(not s.is_mesh() for s in scene.shapes())
         # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
@@ -228,7 +229,9 @@ class Scattering:
             geometry *= self._area(pi, ray, active)
         now = dr.detach(geometry)
         relative = dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
-        return y, ω, dr.select(grazes(y, ω, active), dr.detach(relative), relative)
+        if self.any_curved:
+            relative = dr.select(grazes(y, ω, active), dr.detach(relative), relative)
+        return y, ω, relative
 
     def _area(self, pi, ray, active):
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""

@@ -223,6 +223,8 @@ def simulated(name: str, settings: Settings, folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     found["full"], full = run(name, data, options(settings, brightness=0))
     found["direct"], direct = run(f"{name}, direct light", data, options(settings, brightness=0, max_depth=2))
+    if name.endswith(GREY):
+        found["coat"], _ = run(f"{name}, coat", data, options(settings, brightness=0, coat=True))
     found["starts"] = errors_of(normals, data)
     normals |= {"without interreflections": direct.guess.normals, "with interreflections": full.guess.normals}
     write_errors(folder / picture(name, "errors"), data, {k: angles(n, data.truth) for k, n in normals.items()})
@@ -441,6 +443,7 @@ def of_simulated(found: dict[str, Any]) -> list[str]:
         "direct light only": lambda r: f"{r[1]['direct']['error']:.2f}",
         "the defaults": lambda r: f"**{r[1]['full']['error']:.2f}**",
         "robust start / the defaults": lambda r: f"{robust(r[1]) / r[1]['full']['error']:.1f}",
+        "with `coat`": lambda r: f"{r[1]['coat']['error']:.2f}" if "coat" in r[1] else "",
         "depth: direct light only": lambda r: f"{r[1]['section']['error']['without interreflections']:.2f}",
         "depth: the defaults": lambda r: f"{r[1]['section']['error']['with interreflections']:.2f}",
         "time": lambda r: f"{r[1]['full']['seconds']:.0f} s",
