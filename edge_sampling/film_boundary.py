@@ -162,6 +162,7 @@ class FilmBoundary:
                 on_film = projection.tangent(c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), aperture_sample)
                 along_film = dr.select(is_line, along_film, on_film)
                 valid |= ~is_line & c.valid & (projection.film(c.p).z > projection.near)
+            valid &= (density > 0) & dr.isfinite(dr.squared_norm(along_film))
 
         # Only here does the gradient enter: the velocity of a point that is fixed on the edge.
         with dr.resume_grad():
@@ -171,6 +172,9 @@ class FilmBoundary:
             if self.curves is not None:
                 c = self.curves.point(frames, piece, along, eye, projection.orthographic)
                 p = dr.select(is_line, p, c.p)
+            # What is not visible has no place on the film: any point in front of the sensor stands for it, for even
+            # with the value zero, a sample at a position that is not finite would spoil a pixel.
+            p = dr.select(valid, p, mi.Point3f(projection.eye() + projection.view()))
             u = projection.film(p, aperture_sample).position()
             velocity = u - dr.detach(u)
 
@@ -179,7 +183,7 @@ class FilmBoundary:
             n = dr.normalize(n_dl)
             u, p = dr.detach(u), dr.detach(p)
             offset = self._offset(projection, p) * n
-            active = (density > 0) & valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
+            active = valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             time = sensor.shutter_open()
             if sensor.shutter_open_time() > 0:
                 time += sampler.next_1d() * sensor.shutter_open_time()
@@ -227,7 +231,7 @@ class FilmBoundary:
         index = dr.binary_search(0, last, lambda i: dr.gather(mi.UInt64, cumulative, i) <= whole)
         size = mi.Float64(dr.gather(mi.UInt64, quantised, index))
         start = mi.Float64(dr.gather(mi.UInt64, cumulative, index)) - size
-        along = dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float))
+        along = dr.select(size > 0, dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float)), 0)
         return index, along, dr.select(total > 0, mi.Float(count * size / total), 0)
 
     def _jumps(self, projection: Projection, positions: mi.Float, edge: mi.UInt32) -> mi.Bool:

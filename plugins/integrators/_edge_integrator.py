@@ -220,11 +220,11 @@ class EdgeIntegrator(ADIntegrator):
         # A surface that moves is met by a fixed ray; a ray that moves with the camera takes its hit along.
         pi = self._first_hit(scene, ray, active)
         si = met_by(ray, pi, mi.RayFlags.All, active, attached)
+        if beyond_horizon is not False:
+            up_to_horizon(si, ray, beyond_horizon)
         with dr.resume_grad(when=attached):
             if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
-        if beyond_horizon is not False:
-            up_to_horizon(si, ray, beyond_horizon)
         bsdf = si.bsdf(ray)
         backdrop = active & (scene.environment() is not None and not self.hide_emitters)
         active &= si.is_valid()

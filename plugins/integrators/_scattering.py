@@ -229,9 +229,11 @@ class Scattering:
             geometry *= self._area(pi, ray, active)
         now = dr.detach(geometry)
         relative = dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
+        still = active & flush(si, y)
         if self.any_curved:
-            relative = dr.select(grazes(y, ω, active), dr.detach(relative), relative)
-        return y, ω, relative
+            still |= grazes(y, ω, active)
+        y = dr.select(still, dr.detach(y), y)
+        return y, dr.select(still, dr.detach(ω), ω), dr.select(still, dr.detach(relative), relative)
 
     def _area(self, pi, ray, active):
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
@@ -260,9 +262,26 @@ class Scattering:
 GRAZING = 1e-3
 
 
+def flush(x: mi.SurfaceInteraction3f, y: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Does y lie in the tangent plane at x, or x in that at y, as far as single precision can tell?
+
+    So do points of one face, and points close to each other on one curved surface: one does not light the other, but
+    the cosine between them is what rounding makes it, and its derivative relative to that is arbitrarily large.
+    """
+    with dr.suspend_grad():
+        d = y.p - x.p
+        scale = dr.max(dr.maximum(dr.abs(x.p), dr.abs(y.p)))
+        height = dr.minimum(dr.abs_dot(x.n, d), dr.abs_dot(y.n, d))
+        return height <= FLUSH * dr.epsilon(mi.Float) * scale
+
+
+#: Height over a tangent plane that is taken for rounding, in units in the last place of the coordinates.
+FLUSH = 16
+
+
 def grazes(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Bool:
     """Is a curved surface met almost along a tangent?"""
-    return active & ~si.shape.is_mesh() & (dr.abs_dot(dr.detach(si.n), dr.detach(direction)) < GRAZING)
+    return active & si.is_valid() & ~si.shape.is_mesh() & (dr.abs_dot(dr.detach(si.n), dr.detach(direction)) < GRAZING)
 
 
 def met_by(
