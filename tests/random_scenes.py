@@ -1,0 +1,647 @@
+"""Ordinary scenes that nobody chose: made from a seed, and their derivatives compared with finite differences.
+
+    python tests/random_scenes.py --seeds 0 1000 --processes 2        # some seconds a scene
+    python tests/random_scenes.py --only 17 --thorough
+
+A scene has a floor and one to three things that hover apart from it and from each other, of random shapes and
+materials, some of them lamps; one or two lights; a sensor with its film; and one to three parameters that change
+together with one number θ. All of it may be scaled, and shifted away from the origin. What the documentation calls
+missing is left out: meshes that touch or cut each other, perfect mirrors and glass, textures that jump.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import rimlight  # isort: skip (first: it chooses the LLVM library)
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Half of the difference between the two values of θ. Images move by a few hundredths of a pixel.
+STEP = 2e-3
+
+#: Samples per pixel of one image of the finite differences, and of one derivative.
+REFERENCE_SPP, SPP = 1024, 256
+
+#: How many of each are made: at first, and when that does not suffice to tell right from wrong.
+STAGES = ((10, 6), (24, 24), (80, 96))
+
+#: The derivative is right if its projection on the reference is 1 within this, and `ERRORS` standard errors.
+TOLERANCE, ERRORS = 0.015, 4.0
+
+#: A projection whose standard error is above this tells nothing: more samples are taken.
+TELLING = 0.03
+
+
+# ---------------------- Shapes ----------------------
+
+
+def quad() -> tuple[np.ndarray, ...]:
+    p = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]], float)
+    return p, np.tile([0, 0, 1], (4, 1)), (p[:, :2] + 1) / 2, np.array([[0, 1, 2], [1, 3, 2]])
+
+
+def grid(point: Callable, n: int, m: int) -> tuple[np.ndarray, ...]:
+    """n × m quads over (u, v) in the unit square, as exporters write them: seams with vertices of their own."""
+    v, u = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, m + 1), np.linspace(0, 1, n + 1), indexing="ij"))
+    p, normal = point(2 * np.pi * u, v)
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(m)))
+    a = j * (n + 1) + i
+    faces = np.concatenate([np.stack([a, a + n + 1, a + 1], 1), np.stack([a + 1, a + n + 1, a + n + 2], 1)])
+    corners = p[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    faces = faces[area > 1e-9]
+    outwards = np.einsum(
+        "ij,ij->i",
+        np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]]),
+        normal[faces].mean(1),
+    )
+    faces = np.where(outwards[:, None] > 0, faces, faces[:, ::-1])
+    return p, normal, np.stack([u, v], 1), faces
+
+
+def ball(n: int, part: float = 1.0) -> tuple[np.ndarray, ...]:
+    """part : 1 for all of a ball of radius 1, 0.5 for the upper half, which is open."""
+
+    def point(φ, v):
+        θ = np.pi * part * v
+        p = np.stack([np.sin(θ) * np.cos(φ), np.sin(θ) * np.sin(φ), np.cos(θ)], 1)
+        return p, p
+
+    return grid(point, 2 * n, n)
+
+
+def torus(n: int) -> tuple[np.ndarray, ...]:
+    def point(φ, v):
+        ψ = 2 * np.pi * v
+        normal = np.stack([np.cos(ψ) * np.cos(φ), np.cos(ψ) * np.sin(φ), np.sin(ψ)], 1)
+        ring = np.stack([np.cos(φ), np.sin(φ), 0 * φ], 1)
+        return 0.7 * ring + 0.28 * normal, normal
+
+    return grid(point, 2 * n, n)
+
+
+def tetrahedron() -> tuple[np.ndarray, ...]:
+    p = np.array([[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]]) * 0.7
+    return p, p, p[:, :2], np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+# ---------------------- Scenes ----------------------
+
+
+@dataclass
+class RandomScene:
+    """scene, params : of Mitsuba.
+    move : puts all that changes where θ says.
+    integrator : what is tested, as a dictionary; `max_depth` of its paths.
+    label : what is in the scene.
+    """
+
+    scene: mi.Scene
+    params: mi.SceneParameters
+    move: Callable[[mi.Float], None]
+    integrator: dict[str, Any]
+    max_depth: int
+    label: str
+
+
+class Generator:
+    """Makes one scene. The same seed makes the same one, but for the sampler of its sensor."""
+
+    def __init__(self, seed: int, sampler: str):
+        self.rng = np.random.default_rng([seed, 14])
+        self.sampler = sampler
+        self.objects: dict[str, Any] = {"type": "scene"}
+        self.labels: list[str] = []
+        #: What may change: name of the parameter, and how.
+        self.movable: dict[str, list[tuple[str, str, np.ndarray]]] = {"thing": [], "light": [], "camera": [], "look": []}
+
+    def pick(self, *options):
+        return options[self.rng.integers(len(options))]
+
+    def chance(self, p: float) -> bool:
+        return bool(self.rng.random() < p)
+
+    def uniform(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def direction(self) -> np.ndarray:
+        v = self.rng.normal(size=3)
+        return v / np.linalg.norm(v)
+
+    def rotation(self) -> np.ndarray:
+        q = np.linalg.qr(self.rng.normal(size=(3, 3)))[0]
+        return q * np.sign(np.linalg.det(q))
+
+    def make(self) -> RandomScene:
+        # Where all of it is: a number of the scene is this many scene units, and its origin is here.
+        self.scale = self.pick(1.0, 1.0, 1.0, 1.0, 1e-3, 1e-2, 30.0, 1e4)
+        self.origin = self.direction() * self.scale * self.pick(0, 0, 0, 3, 20)
+        self.labels.append(f"x{self.scale:g}" + (f"@{np.linalg.norm(self.origin):g}" if self.origin.any() else ""))
+        direct = self.chance(0.6)
+        depth = 2 if direct else int(self.rng.integers(2, 6))
+        integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
+        self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
+
+        instances = self.chance(0.06)
+        self.make_sensor()
+        self.make_floor()
+        for i in range(self.rng.integers(1, 4)):
+            self.make_thing(i)
+        if instances:
+            self.make_instances()
+        kinds: list[str] = []
+        for i in range(self.rng.integers(1, 3)):
+            kinds.append(self.make_light(i, kinds))
+        scene = mi.load_dict(self.objects)
+        params, move = self.make_motion(scene, cameras=not instances)
+        return RandomScene(scene, params, move, integrator, depth, " ".join(self.labels))
+
+    # ---------------------- Placing ----------------------
+
+    def place(self, p) -> np.ndarray:
+        return np.asarray(p, float) * self.scale + self.origin
+
+    def frame(self, linear: np.ndarray, centre) -> mi.ScalarTransform4f:
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = np.asarray(linear) * self.scale, self.place(centre)
+        return mi.ScalarTransform4f(m)
+
+    def look(self, origin, target, up=(0, 1, 0)) -> mi.ScalarTransform4f:
+        return mi.ScalarTransform4f().look_at(list(self.place(origin)), list(self.place(target)), list(map(float, up)))
+
+    # ---------------------- Materials ----------------------
+
+    def colour(self, low=0.2, high=0.9) -> dict:
+        return {"type": "rgb", "value": [self.uniform(low, high) for _ in range(3)]}
+
+    def bitmap(self, height: int, width: int, low=0.1, high=0.9) -> dict:
+        return {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(self.rng.uniform(low, high, (height, width, 3)).astype(np.float32)),
+            "raw": True,
+            "filter_type": "bilinear",
+            "wrap_mode": self.pick("clamp", "mirror"),
+        }
+
+    def bsdf(self, uv: bool = False, closed: bool = False) -> tuple[str, dict]:
+        kinds = ["diffuse", "diffuse", "twosided", "roughplastic", "roughconductor", "principled", "blend"]
+        kinds += ["roughdielectric"] * closed + ["texture", "texture", "normalmap"] * uv
+        kind = self.pick(*kinds)
+        colour, alpha = self.colour(), self.uniform(0.1, 0.4)
+        bsdf = {
+            "diffuse": lambda: {"type": "diffuse", "reflectance": colour},
+            "twosided": lambda: {"type": "twosided", "inner": {"type": "diffuse", "reflectance": colour}},
+            "roughplastic": lambda: {"type": "roughplastic", "alpha": alpha, "diffuse_reflectance": colour},
+            "roughconductor": lambda: {"type": "roughconductor", "alpha": alpha},
+            "roughdielectric": lambda: {"type": "roughdielectric", "alpha": 0.2 + alpha, "int_ior": 1.3},
+            "principled": lambda: {
+                "type": "principled",
+                "base_color": colour,
+                "roughness": self.uniform(0.3, 0.8),
+                "specular": 0.5,
+                "metallic": self.uniform(0, 1),
+            },
+            "blend": lambda: {
+                "type": "blendbsdf",
+                "weight": self.uniform(0.2, 0.8),
+                "first": {"type": "diffuse", "reflectance": colour},
+                "second": {"type": "roughconductor", "alpha": alpha},
+            },
+            "texture": lambda: {"type": "diffuse", "reflectance": self.bitmap(5, 7)},
+            "normalmap": lambda: {
+                "type": "normalmap",
+                "normalmap": self.normal_map(),
+                "bsdf": {"type": "diffuse", "reflectance": colour},
+            },
+        }[kind]()
+        return kind, bsdf
+
+    def normal_map(self) -> dict:
+        n = np.concatenate([self.rng.uniform(-0.2, 0.2, (5, 7, 2)), np.ones((5, 7, 1))], 2)
+        n = n / np.linalg.norm(n, axis=2, keepdims=True) * 0.5 + 0.5
+        return {"type": "bitmap", "bitmap": mi.Bitmap(n.astype(np.float32)), "raw": True, "wrap_mode": "clamp"}
+
+    @staticmethod
+    def two_sided(bsdf: dict) -> dict:
+        return bsdf if bsdf["type"] in ("twosided", "principled") else {"type": "twosided", "inner": bsdf}
+
+    def emitter(self, low: float, high: float) -> dict:
+        return {"type": "area", "radiance": {"type": "rgb", "value": [self.uniform(low, high) for _ in range(3)]}}
+
+    # ---------------------- Objects ----------------------
+
+    def mesh(self, name: str, shape, linear, centre, bsdf=None, emitter=None, smooth=False, uv=True) -> mi.Mesh:
+        p, normals, coordinates, faces = shape
+        props = mi.Properties()
+        for key, value in (("bsdf", bsdf), ("emitter", emitter)):
+            if value is not None:
+                props[key] = mi.load_dict(value)
+        m = mi.Mesh(name, len(p), len(faces), has_vertex_normals=smooth, has_vertex_texcoords=uv, props=props)
+        values = mi.traverse(m)
+        values["vertex_positions"] = np.float32(self.place(p @ np.asarray(linear).T + centre)).ravel()
+        values["faces"] = np.uint32(faces).ravel()
+        if smooth:
+            n = normals @ np.linalg.inv(linear)
+            values["vertex_normals"] = np.float32(n / np.linalg.norm(n, axis=1, keepdims=True)).ravel()
+        if uv:
+            values["vertex_texcoords"] = np.float32(coordinates).ravel()
+        values.update()
+        m.set_id(name)
+        return m
+
+    def make_sensor(self) -> None:
+        kind = self.pick("perspective", "perspective", "perspective", "thinlens", "orthographic", "fisheye", "batch")
+        rfilter = self.pick("box", "box", "gaussian", "tent", "mitchell")
+        res = 20
+        film = {
+            "type": "hdrfilm",
+            "width": res,
+            "height": res,
+            "rfilter": {"type": rfilter},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "sample_border": self.chance(0.6) and kind != "batch",
+        }
+        self.labels.append(f"{kind}/{rfilter}")
+        if self.chance(0.15) and kind not in ("batch", "fisheye"):
+            film.update(crop_offset_x=4, crop_offset_y=2, crop_width=12, crop_height=15)
+            self.labels[-1] += "/crop"
+        origin = np.array([self.uniform(-1.5, 1.5), self.uniform(1.2, 3), 4.6])
+        target = [self.uniform(-0.2, 0.2), 0.5, 0]
+        to_world = self.look(origin, target)
+        sensor: dict[str, Any] = {
+            "type": kind,
+            "to_world": to_world,
+            "film": film,
+            "sampler": {"type": self.sampler},
+            "near_clip": 0.01 * self.scale,
+            "far_clip": 1000 * self.scale,
+        }
+        if kind in ("perspective", "thinlens"):
+            sensor["fov"] = self.uniform(32, 48)
+            if self.chance(0.3):
+                sensor["principal_point_offset_x"] = self.uniform(-0.1, 0.1)
+        if kind == "thinlens":
+            sensor.update(aperture_radius=0.08 * self.scale, focus_distance=5.0 * self.scale)
+        if kind == "orthographic":
+            s = 1.7 * self.scale
+            sensor["to_world"] = to_world @ mi.ScalarTransform4f().scale([s, s, 1])
+        if kind == "fisheye":
+            sensor["fov"] = self.uniform(50, 160)
+            del sensor["near_clip"], sensor["far_clip"]
+        name = "sensor"
+        if kind == "batch":
+            one = {**sensor, "type": "perspective", "fov": 45.0}
+            other = {**one, "to_world": self.look(origin + [-1.0, 0.2, 0.1], target), "film": dict(film)}
+            wide = {**film, "width": 2 * res}
+            sensor = {"type": "batch", "one": one, "two": other, "film": wide, "sampler": one["sampler"]}
+            name = "sensor.one"
+        self.objects["sensor"] = sensor
+        moves = self.movable["camera"]
+        moves += [(f"{name}.to_world", "pose", origin)] * 3
+        if kind in ("perspective", "thinlens"):
+            moves += [("sensor.x_fov", "number", np.array([4.0]))]
+            moves += [(f"sensor.principal_point_offset_{a}", "number", np.array([0.1])) for a in "xy"]
+        if kind == "thinlens":
+            moves += [("sensor.aperture_radius", "number", np.array([0.1 * self.scale]))]
+            moves += [("sensor.focus_distance", "number", np.array([1.0 * self.scale]))]
+        if kind == "fisheye":
+            moves += [("sensor.fov", "number", np.array([10.0]))]
+
+    def make_floor(self) -> None:
+        p, n, uv, faces = quad()
+        kind, bsdf = self.bsdf(uv=True)
+        flat = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) * 3.0  # its normal upwards
+        self.objects["floor"] = self.mesh("floor", (p, n, uv, faces), flat, [0, -0.4, 0], bsdf)
+        self.labels.append(f"floor:{kind}")
+        if kind in ("diffuse", "texture"):
+            key = "data" if kind == "texture" else "value"
+            self.movable["look"].append((f"floor.bsdf.reflectance.{key}", "colour", np.zeros(3)))
+
+    def make_thing(self, i: int) -> None:
+        kinds = ("cube", "smoothcube", "ball", "ball", "fine", "sphere", "cylinder", "disk", "torus", "tetra", "quad")
+        kind = self.pick(*kinds, "half", "needle")
+        name = f"thing{i}"
+        centre = [[-0.9, 0.5, 0], [0.9, 0.7, -0.3], [0, 1.6, 0.4]][i] + self.rng.uniform(-0.1, 0.1, 3)
+        size, q = self.uniform(0.35, 0.55), self.rotation()
+        closed = kind not in ("quad", "half", "disk", "cylinder", "needle")
+        uv = kind not in ("sphere", "cylinder", "disk", "tetra") and self.chance(0.6)
+        material, bsdf = self.bsdf(uv, closed and kind != "torus")
+        if not closed:
+            bsdf = self.two_sided(bsdf) if material != "roughdielectric" else bsdf
+        lamp = self.chance(0.15)
+        emitter = self.emitter(0.5, 3) if lamp else None
+        smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
+        label = f"{'smooth-' if smooth and kind != 'fine' else ''}{kind}:{material}{':lamp' if lamp else ''}"
+        extra = {"bsdf": bsdf, **({"emitter": emitter} if lamp else {})}
+        key, how = f"{name}.vertex_positions", "vertices"
+        if kind in ("cube", "smoothcube"):
+            made: Any = {
+                "type": "cube",
+                "face_normals": kind == "cube",
+                "to_world": self.frame(q * size * 0.7, centre),
+                **extra,
+            }
+        elif kind in ("sphere", "cylinder", "disk"):
+            linear = q * size if kind != "cylinder" else q @ np.diag([0.6, 0.6, 1]) * size
+            made = {"type": kind, "to_world": self.frame(linear, centre), **extra}
+            key, how = f"{name}.to_world", "frame"
+        else:
+            n = {"ball": self.pick(4, 8, 12, 24), "fine": 70, "half": self.pick(6, 12), "torus": self.pick(8, 12, 20)}
+            shape, linear = {
+                "ball": lambda: (ball(n["ball"]), q * size),
+                "fine": lambda: (ball(n["fine"]), q * size),
+                "half": lambda: (ball(n["half"], 0.5), q * size),
+                "torus": lambda: (torus(n["torus"]), q * size * 1.1),
+                "tetra": lambda: (tetrahedron(), q * size),
+                "quad": lambda: (quad(), q * size),
+                "needle": lambda: (ball(6), q @ np.diag([1.2, 0.03, 0.03]) * size),
+            }[kind]()
+            label += f"/{len(shape[3])}"
+            made = self.mesh(name, shape, linear, centre, bsdf, emitter, smooth, uv)
+        self.objects[name] = made
+        self.labels.append(label)
+        self.movable["thing"] += [(key, how, centre)] * 3
+        if how == "vertices":
+            self.movable["thing"].append((key, "bend", centre))
+        if lamp:
+            self.movable["look"].append((f"{name}.emitter.radiance.value", "colour", np.zeros(3)))
+
+    def make_instances(self) -> None:
+        """Two small copies of a mesh, aside, where they throw no shadow on anything that moves."""
+        self.objects["group"] = {
+            "type": "shapegroup",
+            "shape": {"type": "cube", "bsdf": {"type": "diffuse", "reflectance": self.colour()}},
+        }
+        for i, x in enumerate((-2.3, 2.3)):
+            self.objects[f"copy{i}"] = {
+                "type": "instance",
+                "to_world": self.frame(self.rotation() * 0.12, [x, -0.1, -1.5]),
+                "shapegroup": {"type": "ref", "id": "group"},
+            }
+        self.labels.append("instances")
+
+    def make_light(self, i: int, before: list[str]) -> str:
+        name = f"light{i}"
+        kinds = ("area", "ball", "disklight", "meshball", "point", "spot", "sun", "sky", "environment")
+        kind = self.pick(*kinds)
+        if kind in ("sky", "environment") and {"sky", "environment"} & set(before):
+            kind = "area"
+        centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])
+        power, grey = self.uniform(0.5, 1.5), lambda v: {"type": "rgb", "value": v}
+        area = lambda v: {"type": "area", "radiance": grey(v)}
+        down = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        moves = self.movable["light"]
+        if kind == "area":
+            made: Any = self.mesh(name, quad(), down @ np.diag([0.4] * 3), centre, None, area(20 * power), uv=False)
+            moves += [(f"{name}.vertex_positions", "vertices", centre)] * 2
+        elif kind == "meshball":
+            n = self.pick(4, 8, 16)
+            linear = self.rotation() * 0.4
+            made = self.mesh(name, ball(n), linear, centre, None, area(15 * power), self.chance(0.5), uv=False)
+            moves += [(f"{name}.vertex_positions", "vertices", centre)] * 2
+        elif kind in ("ball", "disklight"):
+            shape, linear = ("sphere", np.eye(3)) if kind == "ball" else ("disk", down)
+            made = {"type": shape, "to_world": self.frame(linear * 0.4, centre), "emitter": area(15 * power)}
+            moves += [(f"{name}.to_world", "frame", centre)] * 2
+        elif kind == "point":
+            made = {"type": "point", "position": list(self.place(centre)), "intensity": grey(15 * power * self.scale**2)}
+            moves += [(f"{name}.position", "position", centre)]
+        elif kind == "spot":
+            made = {
+                "type": "spot",
+                "to_world": self.look(centre, [0, 0.4, 0], [0, 0, 1]),
+                "intensity": grey(25 * power * self.scale**2),
+                "cutoff_angle": 40,
+                "beam_width": 25,
+            }
+            moves += [(f"{name}.to_world", "pose", centre)]
+        elif kind == "sun":
+            made = {"type": "directional", "direction": [*(-centre / 2)], "irradiance": grey(2 * power)}
+            moves += [(f"{name}.to_world", "turn", centre)]
+        elif kind == "sky":
+            made = {"type": "constant", "radiance": grey(0.6 * power)}
+        else:
+            made = {"type": "envmap", "bitmap": mi.Bitmap(self.rng.uniform(0, 1.2, (6, 12, 3)).astype(np.float32))}
+            moves += [(f"{name}.to_world", "turn", centre)]
+        self.objects[name] = made
+        self.labels.append(kind)
+        if kind == "area":
+            self.movable["look"].append((f"{name}.emitter.radiance.value", "colour", np.zeros(3)))
+        return kind
+
+    # ---------------------- Motion ----------------------
+
+    def make_motion(self, scene: mi.Scene, cameras: bool) -> tuple[mi.SceneParameters, Callable[[mi.Float], None]]:
+        params = mi.traverse(scene)
+        chosen: dict[str, tuple[str, np.ndarray]] = {}
+        for _ in range(self.pick(1, 1, 1, 2, 3)):
+            who = self.pick("thing", "thing", "thing", "camera", "camera", "light", "light", "look")
+            if who == "camera" and not cameras:
+                who = "thing"
+            options = self.movable[who] or self.movable["thing"]
+            key, how, centre = options[self.rng.integers(len(options))]
+            if key in params:
+                chosen.setdefault(key, (how, centre))
+        if not chosen:
+            key, how, centre = self.movable["thing"][0]
+            chosen[key] = (how, centre)
+        self.labels.append("moves " + "+".join(f"{key}({how})" for key, (how, _) in chosen.items()))
+        params.keep(list(chosen))
+        moves = [self.mover(params, key, how, centre) for key, (how, centre) in chosen.items()]
+
+        def move(θ: mi.Float) -> None:
+            for change in moves:
+                change(θ)
+            params.update()
+
+        return params, move
+
+    def mover(self, params, key: str, how: str, centre) -> Callable[[mi.Float], None]:
+        initial = type(params[key])(params[key])
+        axis, way, turn = self.direction(), self.direction(), self.uniform(-20, 20)
+        speed, centre = float(centre[0]), self.place(centre)
+        vector = lambda v: mi.Vector3f(*map(float, v))
+
+        def rigid(θ):
+            T = mi.Transform4f
+            moved = T() if how == "turn" else T().translate(vector(way * self.scale) * θ)
+            about = (0, 0, 0) if how == "turn" else centre
+            return moved @ T().translate(vector(about)) @ T().rotate(vector(axis), θ * turn) @ T().translate(
+                -vector(about)
+            )
+
+        def change(θ):
+            if how == "vertices":
+                params[key] = dr.ravel(rigid(θ) @ dr.unravel(mi.Point3f, initial))
+            elif how == "bend":
+                p = dr.unravel(mi.Point3f, initial)
+                s = dr.dot((p - mi.Point3f(*map(float, centre))) / self.scale, vector(axis))
+                params[key] = dr.ravel(p + vector(way * self.scale) * (θ * dr.sin(3 * s + 1)))
+            elif how == "number":
+                params[key] = initial + θ * speed
+            elif how == "colour":
+                params[key] = initial * (1 + 10 * θ) if not dr.is_tensor_v(initial) else type(initial)(
+                    initial.array * (1 + 10 * θ), initial.shape
+                )
+            else:  # a transformation, or the position of a light
+                params[key] = rigid(θ) @ initial
+
+        return change
+
+
+def make(seed: int, sampler: str = "independent") -> RandomScene:
+    return Generator(seed, sampler).make()
+
+
+# ---------------------- Comparison ----------------------
+
+
+@dataclass
+class Comparison:
+    """A derivative against its reference.
+
+    scale, error : projection ⟨g, ref⟩ / ⟨ref, ref⟩ over the pixels where the reference is not noise, and its standard
+        error.
+    relative, noise : Σ|g − ref| / Σ|ref|, and what of it noise explains.
+    size : Σ|ref|.
+    finite : is every number of the derivative?
+    """
+
+    seed: int
+    label: str
+    scale: float = math.nan
+    error: float = math.nan
+    relative: float = math.nan
+    noise: float = math.nan
+    size: float = 0.0
+    finite: bool = True
+    seconds: float = 0.0
+    stage: int = 0
+    raised: str = ""
+
+    @property
+    def agrees(self) -> bool:
+        if self.raised or not self.finite:
+            return False
+        if self.size == 0:
+            return self.relative == 0  # nothing is seen to change
+        # Not all of a difference need lie along the reference: what noise does not explain must be small as well.
+        return abs(self.scale - 1) <= TOLERANCE + ERRORS * self.error and self.relative <= 0.04 + 1.3 * self.noise
+
+    def __str__(self) -> str:
+        verdict = "ERR" if self.raised else "ok " if self.agrees else "BAD" if self.finite else "NAN"
+        numbers = f"scale {self.scale:.3f}+-{self.error:.3f} L1 {self.relative:.3f} noise {self.noise:.3f}"
+        numbers += f" |ref| {self.size:9.3g} {self.seconds:5.1f} s  "
+        return f"{self.seed:6d} {verdict} {self.stage} " + (self.raised if self.raised else numbers) + " " + self.label
+
+
+def statistics(reference: np.ndarray, derivative: np.ndarray, row: Comparison) -> None:
+    """Fill in a row from runs of both: (R, H, W, C)."""
+    ref, g = reference.mean(0), derivative.mean(0)
+    ref_error = reference.std(0, ddof=1) / math.sqrt(len(reference))
+    g_error = derivative.std(0, ddof=1) / math.sqrt(len(derivative))
+    row.finite, row.size = bool(np.isfinite(derivative).all()), float(np.abs(ref).sum())
+    row.relative = row.noise = 0.0
+    # Each half of the reference weighs the pixels of the other: weights with the noise of what they weigh, and pixels
+    # chosen by it, would make the reference seem larger than it is.
+    products = []
+    for mine, others in ((reference[::2], reference[1::2]), (reference[1::2], reference[::2])):
+        mean, error = mine.mean(0), mine.std(0, ddof=1) / math.sqrt(len(mine))
+        weight = np.where(np.abs(mean) > 3 * error, mean, 0)
+        products.append([(runs * weight).sum((1, 2, 3)) for runs in (derivative, others)])
+    ours, theirs = (sum(float(p[k].mean()) for p in products) for k in (0, 1))
+    if theirs <= 0:  # too little is seen to change
+        row.size, row.relative = 0.0, float(np.abs(g).sum() > 4 * np.abs(g_error).sum())
+        return
+    row.scale = ours / theirs
+    variance = (products[0][0] + products[1][0]).var(ddof=1) / len(derivative)
+    variance += row.scale**2 * sum(p[1].var(ddof=1) / len(p[1]) for p in products)
+    row.error = math.sqrt(float(variance)) / theirs
+    row.relative = float(np.abs(g - ref).sum()) / row.size
+    row.noise = math.sqrt(2 / math.pi) * float(np.hypot(g_error, ref_error).sum()) / row.size
+
+
+def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES) -> Comparison:
+    """Compare a scene's derivative with finite differences, with more samples until the answer is clear."""
+    start, row = time.time(), Comparison(seed, "")
+    try:
+        still, moving = make(seed, "multijitter"), make(seed)
+        row.label = still.label
+        path = mi.load_dict({"type": "path", "max_depth": still.max_depth, "rr_depth": 1000})
+        integrator = mi.load_dict(moving.integrator)
+        reference, derivative = [], []
+        for row.stage, (references, derivatives) in enumerate(stages):
+            while len(reference) < references:
+                images = []
+                for θ in (STEP, -STEP):
+                    still.move(mi.Float(θ))
+                    image = mi.render(still.scene, integrator=path, spp=REFERENCE_SPP, seed=len(reference))
+                    images.append(np.array(image, np.float64))
+                reference.append((images[0] - images[1]) / (2 * STEP))
+            while len(derivative) < derivatives:
+                θ = mi.Float(0)
+                dr.enable_grad(θ)
+                moving.move(θ)
+                dr.forward(θ, dr.ADFlag.ClearEdges)
+                seed = 1000 + len(derivative)
+                image = integrator.render_forward(moving.scene, moving.params, seed=seed, spp=SPP)
+                derivative.append(np.array(image, np.float64))
+            statistics(np.array(reference), np.array(derivative), row)
+            if not row.finite or (row.agrees and not row.error > TELLING):
+                break
+    except Exception as error:
+        row.raised = f"{type(error).__name__}: {str(error).strip().splitlines()[-1][:160]}"
+    row.seconds = time.time() - start
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs=2, default=(0, 40), help="first seed, and the one after the last")
+    parser.add_argument("--only", type=int, nargs="*", help="these seeds")
+    parser.add_argument("--quick", action="store_true", help="the first stage only")
+    parser.add_argument("--thorough", action="store_true", help="the last stage at once")
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="rows as JSON, one a line; seeds that it has are not repeated")
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    seeds = list(args.only or range(*args.seeds))
+    if args.out and args.out.exists():
+        known = {json.loads(line)["seed"] for line in args.out.read_text().splitlines()}
+        seeds = [s for s in seeds if s not in known]
+    if args.processes > 1:
+        options = [o for o, given in (("--quick", args.quick), ("--thorough", args.thorough)) if given]
+        options += ["--out", str(args.out)] if args.out else []
+        parts = [seeds[k :: args.processes] for k in range(args.processes)]
+        command = [sys.executable, __file__, *options, "--only"]
+        running = [subprocess.Popen([*command, *map(str, part)]) for part in parts if part]
+        sys.exit(max(p.wait() for p in running))
+    stages = STAGES[:1] if args.quick else STAGES[-1:] if args.thorough else STAGES
+    bad = []
+    for seed in seeds:
+        row = compare(seed, stages)
+        print(row, flush=True)
+        bad += [] if row.agrees else [seed]
+        if args.out:
+            with args.out.open("a") as file:
+                file.write(json.dumps({**asdict(row), "agrees": row.agrees}) + "\n")
+        dr.flush_malloc_cache()
+    print(f"{len(seeds) - len(bad)} of {len(seeds)} random scenes agree; not: {bad}")
+    sys.exit(bool(bad))
+
+
+if __name__ == "__main__":
+    main()
