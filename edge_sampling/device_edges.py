@@ -143,5 +143,10 @@ class DeviceEdges:
 
 def beside_edge(p: mi.Point3f, q: mi.Point3f) -> mi.Float:
     """How far beside an edge at p to look, from q or from p: just beyond what single precision can tell apart."""
+    return rounding(p, q) + 1e-5 * dr.norm(p - q)
+
+
+def rounding(p: mi.Point3f, q: mi.Point3f) -> mi.Float:
+    """How far from p or q a point may seem to lie that is computed from both, in single precision."""
     scale = dr.max(dr.maximum(dr.abs(mi.Vector3f(p)), dr.abs(mi.Vector3f(q))))
-    return 32 * dr.epsilon(mi.Float) * scale + 1e-5 * dr.norm(p - q)
+    return 32 * dr.epsilon(mi.Float) * scale

@@ -226,12 +226,13 @@ class ShadingBoundary:
             side = outline.outward(across)
             active &= side != 0
             n_dl = dr.select(active, n_dl, 0)
-            beside = mi.Point3f(p + side * beside_edge(p, x) * across)
-            ray = si.spawn_ray(dr.normalize(beside - x))
+            aside = beside_edge(p, x)
+            ray = si.spawn_ray(dr.normalize(mi.Point3f(p + side * aside * across) - x))
             pi = scene.ray_intersect_preliminary(ray, active=active)
-            # Something before the edge hides it. (A surface on which it lies may be met just before it.)
-            active &= ~pi.is_valid() | (pi.t >= distance * (1 - 1e-3))
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            # What is met before the edge hides it, unless it is a surface on which the edge lies: beside the edge, that
+            # may be met a little earlier.
+            active &= ~(pi.is_valid() & (pi.t < distance) & (dr.abs_dot(y.n, p - y.p) > aside))
             emitter = y.emitter(scene, active)
             lit = active & emission & (emitter == light)
             L = emitter.eval(y, lit)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .device_edges import beside_edge
+from .device_edges import beside_edge, rounding
 from .edge_importance import View, power_heuristic
 from .lights import Lights
 from .projection import Projection, inside_frame
@@ -173,16 +173,18 @@ class ShadowBoundary:
             seen = first_hit(scene, ray, active)
             active &= seen.is_valid() & (seen.shape == fallen.shape)
             si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            active &= dr.norm(si.p - x) <= 1e-3 * seen.t
+            # It sees this place, and nothing that lies before it: x was moved along the surface, and a little off it.
+            active &= dr.abs_dot(si.n, x - si.p) <= dr.norm(x - hit.p) + rounding(x, ray.o)
 
             # ---------------------- What arrives from the light ----------------------
 
             # From x to the edge, nothing is in the way: that has been seen already.
             onwards = mi.Ray3f(p + aside, dr.select(far, -ω, dr.normalize(y - p - aside)), time, ray.wavelengths)
             distance = dr.norm(y - onwards.o)
-            onwards.maxt = dr.select(on_surface | far, dr.largest(mi.Float), distance * (1 - 1e-4))
+            onwards.maxt = dr.select(on_surface | far, dr.largest(mi.Float), distance)
             met = scene.ray_intersect_preliminary(onwards, active=active)
-            reached = met.is_valid() & (dr.abs(met.t - distance) <= 1e-3 * distance)
+            reached = met.is_valid() & (met.shape.emitter() == emitter)
+            reached &= dr.abs_dot(n, onwards(met.t) - y) <= rounding(y, onwards.o)
             active &= dr.select(on_surface, reached, ~met.is_valid())
             ω_x, L = mi.Vector3f(0, 0, 1), mi.Spectrum(0)
             if self.any_other:
