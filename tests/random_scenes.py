@@ -22,10 +22,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import rimlight  # isort: skip (first: it chooses the LLVM library)
+# isort: off
+import rimlight  # noqa: F401  (first: it chooses the LLVM library)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+# isort: on
 
 #: Half of the difference between the two values of θ. Images move by a few hundredths of a pixel.
 STEP = 2e-3
@@ -154,7 +156,7 @@ class Generator:
         self.origin = self.direction() * self.scale * self.pick(0, 0, 0, 3, 20)
         self.labels.append(f"x{self.scale:g}" + (f"@{np.linalg.norm(self.origin):g}" if self.origin.any() else ""))
         direct = self.chance(0.6)
-        depth = 2 if direct else int(self.rng.integers(2, 6))
+        self.depth = depth = 2 if direct else int(self.rng.integers(2, 6))
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
 
@@ -308,7 +310,7 @@ class Generator:
         name = "sensor"
         if kind == "batch":
             one = {**sensor, "type": "perspective", "fov": 45.0}
-            other = {**one, "to_world": self.look(origin + [-1.0, 0.2, 0.1], target), "film": dict(film)}
+            other = {**one, "to_world": self.look(np.add(origin, [-1.0, 0.2, 0.1]), target), "film": dict(film)}
             wide = {**film, "width": 2 * res}
             sensor = {"type": "batch", "one": one, "two": other, "film": wide, "sampler": one["sampler"]}
             name = "sensor.one"
@@ -402,6 +404,8 @@ class Generator:
         name = f"light{i}"
         kinds = ("area", "ball", "disklight", "meshball", "point", "spot", "sun", "sky", "environment")
         kind = self.pick(*kinds)
+        if self.depth > 2 and kind in ("point", "spot", "sun"):
+            kind = "area"  # hard shadows in indirect light are missing
         if kind in ("sky", "environment") and {"sky", "environment"} & set(before):
             kind = "area"
         centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])
