@@ -85,9 +85,9 @@ class Scattering:
         with dr.resume_grad(when=self.attached and not self.any_hit_by_rays):
             ds, weight = towards_light(active)
         active &= ds.pdf != 0
-        direction = ds.d
+        direction, still = ds.d, mi.Bool(False)
         if self.attached and self.any_hit_by_rays:
-            direction, weight, visible = self._attach_emitter(si, ds, weight, towards_light, active)
+            direction, weight, visible, still = self._attach_emitter(si, ds, weight, towards_light, active)
             active &= visible
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
@@ -95,6 +95,7 @@ class Scattering:
                 ds.delta | self._found_by_light_samples(ds), 1, mis_weight(dr.detach(ds.pdf), dr.detach(pdf))
             )
             L = dr.select(active, f * weight * mis, 0)
+            L = dr.select(still, dr.detach(L), L)
         if not self.attached:
             active &= dr.any(L != 0)
         elif not self.any_hit_by_rays:
@@ -106,7 +107,8 @@ class Scattering:
             return dr.select(active, L, 0)
 
     def _attach_emitter(self, si, ds, weight, towards_light, active):
-        """Direction and weight (Lₑ · geometry / density) of a light sample with their gradients, and its visibility."""
+        """Direction and weight (Lₑ · geometry / density) of a light sample with their gradients, its visibility, and
+        whether it is taken to stand still, see `_connect`."""
         scene = self.scene
         on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
         # One ray answers both questions: is the light visible, and which of its triangles is y on?
@@ -116,7 +118,7 @@ class Scattering:
         pi = scene.ray_intersect_preliminary(ray, active=active)
         visible = dr.select(on_surface, pi.is_valid() & (pi.t >= before), ~pi.is_valid())
         with dr.resume_grad():
-            y, ω, geometry = self._connect(si, pi, ray, on_surface & visible)
+            y, ω, geometry, still = self._connect(si, pi, ray, on_surface & visible)
             direction = dr.select(on_surface, ω, ds.d)
             # Lights at infinity: the direction is fixed.
             attached = y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf)
@@ -129,7 +131,7 @@ class Scattering:
                 moved, at_moved = towards_light(active & follows)
                 direction = dr.select(follows, moved.d, direction)
                 attached = dr.select(follows, at_moved, attached)
-            return direction, dr.replace_grad(weight, attached), visible
+            return direction, dr.replace_grad(weight, attached), visible, still
 
     def sample_bsdf(self, si, bsdf, sampler, active):
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
@@ -146,10 +148,11 @@ class Scattering:
         else:
             with dr.resume_grad():
                 on_surface = active & pi.is_valid()
-                y, ω, geometry = self._connect(si, pi, ray, on_surface)
+                y, ω, geometry, still = self._connect(si, pi, ray, on_surface)
                 ω = dr.select(on_surface, ω, ray.d)
                 f = bsdf.eval(context, si, si.to_local(ω), active & ~mirrored)
                 attached = f * (dr.select(on_surface, geometry, 1) / bs.pdf)
+                attached = dr.select(still, dr.detach(attached), attached)
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
                     turned, at_mirror = bsdf.sample(context, si, sample1, sample2, active & mirrored)
@@ -217,8 +220,8 @@ class Scattering:
         return L
 
     def _connect(self, si, pi, ray, active):
-        """The material point y that `pi` stands for, the direction ω from `si` to it, and |cos θ_y| dA / r² relative
-        to its present value."""
+        """The material point y that `pi` stands for, the direction ω from `si` to it, |cos θ_y| dA / r² relative to its
+        present value, and where all of this is taken to stand still, since rounding would make its derivative."""
         y = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
         d = y.p - si.p
         r2 = dr.squared_norm(d)
@@ -233,7 +236,7 @@ class Scattering:
         if self.any_curved:
             still |= grazes(y, ω, active)
         y = dr.select(still, dr.detach(y), y)
-        return y, dr.select(still, dr.detach(ω), ω), dr.select(still, dr.detach(relative), relative)
+        return y, dr.select(still, dr.detach(ω), ω), dr.select(still, dr.detach(relative), relative), still
 
     def _area(self, pi, ray, active):
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
