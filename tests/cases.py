@@ -305,9 +305,7 @@ def lamps_that_reflect() -> mi.Scene:
     """A ball and a cube that emit and reflect, above a floor."""
     ball = {"type": "sphere", "radius": 0.5, "center": [-0.9, 0.2, 0], "bsdf": diffuse(0.6), "emitter": light(1, 2, 3)}
     cube = mesh("cube", 0.4 * cube_vertices() + [0.9, 0, 0], CUBE_FACES, bsdf=diffuse(0.5), emitter=light(2, 1, 1))
-    return scene(
-        sensor=camera(), thing=ball, cube=cube, floor=horizontal((0, -1.2, 0), 3, "floor", bsdf=diffuse(0.5))
-    )
+    return scene(sensor=camera(), thing=ball, cube=cube, floor=horizontal((0, -1.2, 0), 3, "floor", bsdf=diffuse(0.5)))
 
 
 def shadow_blocker(
@@ -844,30 +842,39 @@ CASES = [
         runs=24,
     ),
     # What random scenes found, in its simplest form.
-    Case("surroundings", before_surroundings(lambda: camera(film=film("gaussian"))), CAMERA_TURN, 1e-3, 0.02, spp=1024),
-    Case("surroundings_thin_lens", before_surroundings(thin_lens), CAMERA_TURN, 1e-3, 0.02, spp=1024),
-    Case("surroundings_orthographic", before_surroundings(orthographic), CAMERA_TURN, 1e-3, 0.02, spp=1024),
-    Case("surroundings_fisheye", before_surroundings(fisheye), CAMERA_TURN, 3e-3, 0.02, spp=1024),
+    Case(
+        "surroundings",
+        before_surroundings(lambda: camera(film=film("gaussian"))),
+        CAMERA_TURN,
+        1e-3,
+        0.02,
+        reference_spp=4096,
+    ),
+    Case("surroundings_thin_lens", before_surroundings(thin_lens), CAMERA_TURN, 1e-3, 0.02, reference_spp=4096),
+    Case("surroundings_orthographic", before_surroundings(orthographic), CAMERA_TURN, 1e-3, 0.02, reference_spp=4096),
+    Case("surroundings_fisheye", before_surroundings(fisheye), CAMERA_TURN, 3e-3, 0.02, reference_spp=4096),
     Case(
         "surroundings_turn",
         before_surroundings(camera),
         {"key": "surroundings.to_world", "rotate": [0.2, 1, 0]},
         4e-3,
-        spp=1024,
+        reference_spp=4096,
     ),
-    Case("glowing_torus", glowing_torus, UP, 6e-3, 0.03, spp=1024, runs=24, largest_z=7),
-    Case("glowing_torus_camera", glowing_torus, CAMERA_UP, 6e-3, 0.03, spp=1024, runs=24, largest_z=7),
-    Case("reflecting_ball", lamps_that_reflect, THING_SIDE, 6e-3, 0.03, spp=1024, runs=24),
-    Case("reflecting_cube", lamps_that_reflect, TURN, 6e-3, 0.03, spp=1024, runs=24),
-    Case("reflecting_camera", lamps_that_reflect, CAMERA_X, 6e-3, 0.03, spp=1024, runs=24),
+    Case("glowing_torus", glowing_torus, UP, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096, largest_z=7),
+    Case(
+        "glowing_torus_camera", glowing_torus, CAMERA_UP, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096, largest_z=7
+    ),
+    Case("reflecting_ball", lamps_that_reflect, THING_SIDE, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096),
+    Case("reflecting_cube", lamps_that_reflect, TURN, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096),
+    Case("reflecting_camera", lamps_that_reflect, CAMERA_X, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096),
     Case(
         "light_out_of_frame",
         shadow_blocker(lambda *a: camera(*a, film=film("tent"))),
         LIGHT_SIDE,
         2e-2,
         0.03,
-        spp=1024,
         runs=24,
+        reference_spp=4096,
     ),
     # Geometry that moves at indirect bounces: only there, and in the frame as well.
     Case("out_of_frame", out_of_frame, SIDE, 0.12, 0.03, spp=1024, runs=100, integrator=prb_edge(3), noisy=True),
