@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from rimlight import ggx, leds
+from rimlight import ggx, leds, no_collection
 
 from .dataset import Dataset
 from .direct import DirectModel, Guess, bsdf_of, own
@@ -252,6 +252,7 @@ class Rendering:
             result["depth"] = (found["vertex_positions"].reshape(-1, 3) * rays).sum(1)
         return result
 
+    @no_collection()
     def visible(self, model: DirectModel) -> np.ndarray:
         """Which lights the surface does not hide from its pixels: (P, K), bool."""
         P, K = model.P, model.K
