@@ -10,14 +10,17 @@ one: see `docs/troubleshooting.md`.
 
 from __future__ import annotations
 
+# isort: off
+import rimlight  # noqa: F401 (first: it chooses the LLVM library)
+
+# isort: on
+
 import gc
 import sys
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
-import rimlight  # noqa: F401 (first: it chooses the LLVM library)
 
 SCENES = 50
 
