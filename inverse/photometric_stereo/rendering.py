@@ -71,8 +71,7 @@ class Domain:
 class Rendering:
     """Renders the images of a data set from a guess and a depth.
 
-    One at a time: with several BSDFs, whose scales are attributes of their meshes, Dr.Jit 1.5 aborts ("invalid
-    redefinition of function"). What became garbage is collected first.
+    What became garbage, such as the one before, is collected first: it may be large.
 
     max_depth : longest path: 2 is direct light, 3 adds one interreflection.
     lights : number of lights that are rendered at a time, the first ones until others are chosen. 0: all.
