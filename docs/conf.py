@@ -3,9 +3,8 @@
 import sys
 from pathlib import Path
 
+import rimlight  # isort: skip (first: it chooses the LLVM library)
 import mitsuba
-
-import rimlight
 
 # The API pages import modules whose annotations need a variant
 mitsuba.set_variant("llvm_ad_rgb")

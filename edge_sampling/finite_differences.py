@@ -11,6 +11,8 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
+from rimlight._collection import no_collection
+
 from .exr import read_exr, write_exr
 from .motion import Motion
 
@@ -113,6 +115,7 @@ def finite_differences(
     return FiniteDifferences(*(a.astype(np.float32) for a in layers), settings)
 
 
+@no_collection()
 def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
     """Render with the `multijitter` sampler, whichever the sensor has: (H, W, C), linear radiance, double precision.
 

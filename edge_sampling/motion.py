@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight._collection import no_collection
+
 
 class Motion:
     """Moves one parameter of a scene along a line, or turns it about an axis: p(θ), where p(0) is its present value.
@@ -123,6 +125,7 @@ class Motion:
         return T().translate(pivot) @ T().rotate(axis, dr.rad2deg(theta)) @ T().translate(-pivot)
 
 
+@no_collection()
 def derivative_image(
     scene: mi.Scene, integrator: mi.Integrator, motion: Motion, *, sensor: int | mi.Sensor = 0, spp: int, seed: int = 0
 ) -> mi.TensorXf:

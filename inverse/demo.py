@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 import rimlight
-from rimlight import pictures, scenes
+from rimlight import no_collection, pictures, scenes
 from rimlight.edge_sampling import Motion, derivative_image, finite_differences
 from rimlight.edge_sampling.exr import replacing
 
@@ -123,7 +123,8 @@ def show_derivatives(study: Study, out: Path) -> Section:
     _free()
     scene = mi.load_file(str(scenes.path(study.scene)))
     motion = Motion(scene, **study.motion)
-    panels = [pictures.Panel(np.array(mi.render(scene, spp=SPP)), "image")]
+    with no_collection():
+        panels = [pictures.Panel(np.array(mi.render(scene, spp=SPP)), "image")]
     reference, seconds = _timed(lambda: finite_differences(scene, motion, step=study.step, runs=16, spp=1024))
     noise = np.sqrt(2 / np.pi) * reference.standard_error.sum() / np.abs(reference.mean).sum()
     results = []
@@ -186,9 +187,8 @@ def show_fit(out: Path) -> Section:
 
 
 def _free() -> None:
-    """Forget scenes and kernels: Dr.Jit 1.5 aborts ("invalid redefinition of function") with those of many scenes."""
+    """Give back the memory of the scene before."""
     gc.collect()
-    dr.flush_kernel_cache()
     dr.flush_malloc_cache()
 
 

@@ -7,9 +7,7 @@ with respect to its pixels weighs a second, independent render, backward. Both a
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight import no_collection
 from rimlight.loading import load_integrator, load_scene, use_variant
 
 from . import classifier, losses, targets
@@ -171,7 +170,8 @@ class View:
         per_pass = max(min(spp, MAX_SAMPLES // (self.size[0] * self.size[1]), 256), 1)
         passes = -(-spp // per_pass)
         for i in range(passes):
-            total = total + np.array(self._image(seed=derived_seed(self.number, i), spp=per_pass), np.float64)
+            with no_collection():  # the integrator may be one of Mitsuba's
+                total += np.array(self._image(seed=derived_seed(self.number, i), spp=per_pass), np.float64)
         return self._colours(total / passes)
 
     def target_at(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -242,7 +242,7 @@ class View:
 
     def render(self, seed: int, spp: int) -> np.ndarray:
         image, _ = self._functions(spp)
-        with _no_collection():
+        with no_collection():
             return self._colours(np.array(image(self.scene, self.integrator, dr.opaque(mi.UInt32, seed))))
 
     def _colours(self, image: np.ndarray) -> np.ndarray:
@@ -254,12 +254,12 @@ class View:
             by_pixel = np.concatenate([by_pixel, np.zeros_like(by_pixel[..., :1])], axis=2)
         weight = mi.TensorXf(by_pixel.astype(np.float32)) * dr.opaque(mi.Float, 1)
         dr.eval(weight)
-        with _no_collection():
+        with no_collection():
             derivative(self.scene, self.integrator, weight, dr.opaque(mi.UInt32, seed))
 
     def forward(self, change: Mapping[str, tuple[mi.Float, np.ndarray]], seed: int, spp: int) -> np.ndarray:
         """Derivative image. change : key -> what `set` returned, and its derivative."""
-        with _no_collection():
+        with no_collection():
             image = mi.render(
                 self.scene, self.params, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed
             )
@@ -301,18 +301,6 @@ class View:
         problem = self.renderer.problem
         possible = hasattr(self.integrator, "find_boundaries") or problem.integrator["type"] in REPLAYED
         return problem.freeze and possible and self.sensor.class_name() not in NOT_REPLAYED
-
-
-@contextmanager
-def _no_collection() -> Iterator[None]:
-    """Dr.Jit ends the process if Python's garbage collector frees a scene while a function is recorded."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def derived_seed(*numbers: int) -> int:

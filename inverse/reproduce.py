@@ -161,10 +161,8 @@ def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(dataclasses.asdict(outcome)), "utf-8")
-    # Dr.Jit 1.5 aborts ("invalid redefinition of function") with the kernels of many scenes.
     del found
     gc.collect()
-    dr.flush_kernel_cache()
     dr.flush_malloc_cache()
     return outcome
 

@@ -14,11 +14,12 @@ It neither sets a variant nor needs one. It also names a suitable LLVM library t
 from rimlight import _llvm
 
 __version__ = "0.1.0"
-__all__ = ["Plan", "__version__", "plan", "register"]
+__all__ = ["Plan", "__version__", "no_collection", "plan", "register"]
 
 _llvm.activate()  # before the line below, which imports Dr.Jit
 
 from rimlight import _registration  # noqa: E402
+from rimlight._collection import no_collection  # noqa: E402
 from rimlight._plan import Plan, plan  # noqa: E402
 from rimlight._registration import register  # noqa: E402
 

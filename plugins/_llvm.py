@@ -258,43 +258,22 @@ def _adopt() -> LLVM | None:
     if usable and found[0] >= MIN_MAJOR:
         named = os.environ.get(VARIABLE, "")
         return LLVM(named or "unknown file", found, ORIGIN_VARIABLE if named else ORIGIN_DRJIT)
-    llvm = _choose()
-    if (usable or llvm is not None) and not _restart():
-        state = f"already uses LLVM {found[0]}" if usable else "found no LLVM and disabled its LLVM backend"
-        message = (
-            f"rimlight: Dr.Jit {state}, where LLVM >= {MIN_MAJOR} is needed. Import `rimlight` before `mitsuba` and "
-            f"`drjit`, or set {VARIABLE} before Python starts."
-        )
-        backend = None if usable else other_backend()
-        if backend is None:
-            raise RuntimeError(message)
-        warnings.warn(f"{message}\nOnly the {backend} backend can be used.", RuntimeWarning, stacklevel=2)
-        return None
-    return llvm
+    # Dr.Jit loads LLVM once. It can be restarted only through functions that it does not expose to Python.
+    state = f"already uses LLVM {found[0]}" if usable else "found no LLVM and disabled its LLVM backend"
+    message = (
+        f"rimlight: Dr.Jit {state}, where LLVM >= {MIN_MAJOR} is needed. Import `rimlight` before `mitsuba` and "
+        f"`drjit`, or {_setting()} before Python starts."
+    )
+    backend = None if usable else other_backend()
+    if backend is None:
+        raise RuntimeError(message)
+    warnings.warn(f"{message}\nOnly the {backend} backend can be used.", RuntimeWarning, stacklevel=2)
+    return None
 
 
-def _restart() -> bool:
-    """Shut Dr.Jit down and start it again, so that it reads the variable anew (20 ms).
-
-    Dr.Jit supports that, but does not expose it to Python. Returns whether the LLVM backend is now in the state that
-    the variable asks for. Not so, and nothing is shut down, once Dr.Jit holds variables or a JIT variant of Mitsuba is
-    loaded: those would be left without their backend. Nor if Dr.Jit's own search found no LLVM: it tries only once.
-    """
-    import drjit as dr
-
-    if any(re.match(r"mitsuba\.(llvm|cuda|metal)_", name) for name in sys.modules):
-        return False
+def _setting() -> str:
+    """What to do with the variable, the end of a sentence."""
     try:
-        (file,) = glob.glob(os.path.join(dr.__path__[0], "libdrjit-core.*"))
-        core = ctypes.CDLL(file)
-        whos, shutdown, init = core._Z12jit_var_whosv, core._Z12jit_shutdowni, core._Z8jit_initj
-    except (ValueError, OSError, AttributeError):
-        return False
-    whos.restype = ctypes.c_char_p
-    shutdown.restype = init.restype = None
-    if b"No variables registered" not in whos():
-        return False
-    shutdown(ctypes.c_int(0))  # 0: unload the backends, too
-    backends = (dr.JitBackend.CUDA, dr.JitBackend.LLVM, getattr(dr.JitBackend, "Metal", None))
-    init(ctypes.c_uint32(sum(1 << backend.value for backend in backends if backend is not None)))
-    return (dr.has_backend(dr.JitBackend.LLVM) == 0) == (os.environ[VARIABLE] == DISABLED)
+        return f"set {VARIABLE}={find(variables={}).path}"
+    except ImportError:
+        return f"run `pip install {PACKAGE}`, or set {VARIABLE} to the file of an LLVM >= {MIN_MAJOR},"

@@ -31,15 +31,6 @@ def free_memory() -> Iterator[None]:
     dr.flush_malloc_cache()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def free_kernels() -> Iterator[None]:
-    """Forget the kernels after each file: Dr.Jit 1.5 aborts ("invalid redefinition of function") with too many."""
-    yield
-    gc.collect()
-    dr.flush_kernel_cache()
-    dr.flush_malloc_cache()
-
-
 @pytest.fixture(scope="session")
 def shared() -> Callable[[str], Path]:
     """Path of a file in the shared data, which are not part of the repository. Skips the test when it is missing."""

@@ -2,18 +2,11 @@
 standard errors."""
 
 import cases
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image, mean_and_error, z_scores
-
-
-@pytest.fixture(autouse=True)
-def forget_kernels(free_memory):
-    yield
-    dr.flush_kernel_cache()
 
 
 def measure(case: cases.Case) -> tuple[np.ndarray, np.ndarray]:

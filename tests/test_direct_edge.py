@@ -11,12 +11,6 @@ from rimlight.edge_sampling import Motion, derivative_image, mean_and_error, z_s
 from rimlight.edge_sampling.exr import read_exr
 
 
-@pytest.fixture(autouse=True)
-def forget_kernels(free_memory):
-    yield
-    dr.flush_kernel_cache()
-
-
 def integrator(**options):
     return mi.load_dict({"type": "direct_edge"} | options)
 

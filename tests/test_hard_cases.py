@@ -25,12 +25,6 @@ def integrator(request) -> Callable[..., mi.Integrator]:
     return lambda **options: mi.load_dict({**INTEGRATORS[request.param], **options})
 
 
-@pytest.fixture(autouse=True)
-def forget_kernels(free_memory):
-    yield
-    dr.flush_kernel_cache()
-
-
 # ---------------------- Scenes ----------------------
 
 

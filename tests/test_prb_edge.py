@@ -13,12 +13,6 @@ from rimlight.edge_sampling import Motion, derivative_image, mean_and_error, z_s
 DEPTH = 4
 
 
-@pytest.fixture(autouse=True)
-def forget_kernels(free_memory):
-    yield
-    dr.flush_kernel_cache()
-
-
 def integrator(**options) -> mi.Integrator:
     return mi.load_dict({"type": "prb_edge", "max_depth": DEPTH, **options})
 

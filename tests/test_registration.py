@@ -191,7 +191,9 @@ def files(folder: Path) -> list[Path]:
 def test_edge_sampling_knows_no_plugin(root: Path) -> None:
     for file in files(root / "edge_sampling"):
         outside = {name for name in imports(file) if name.split(".")[0] == "rimlight"}
-        assert all(name.startswith("rimlight.edge_sampling") for name in outside), f"{file} imports {outside}"
+        # The guard against the garbage collector is everybody's, and knows nothing of Rimlight.
+        allowed = ("rimlight.edge_sampling", "rimlight._collection")
+        assert all(name.startswith(allowed) for name in outside), f"{file} imports {outside}"
 
 
 def test_plugins_do_not_know_the_fits(root: Path) -> None:

@@ -15,12 +15,6 @@ from rimlight.edge_sampling import Motion, derivative_image, finite_differences,
 from rimlight.edge_sampling.exr import read_exr, read_layers, write_exr, write_layers
 
 
-@pytest.fixture(autouse=True)
-def forget_kernels(free_memory):
-    yield
-    dr.flush_kernel_cache()
-
-
 def rig(**options) -> mi.Integrator:
     return mi.load_dict({"type": "rig", **options})
 

@@ -55,12 +55,6 @@ def reference(name: str, of: Sequence[str], scene: mi.Scene, motion: Any, **opti
     return found
 
 
-@pytest.fixture(autouse=True)
-def forget_kernels(free_memory):
-    yield
-    dr.flush_kernel_cache()
-
-
 def rows() -> dict[tuple[str, str], str]:
     """(first cell, column) → what it says, of all tables with the columns `COLUMNS`."""
     found, columns = {}, []

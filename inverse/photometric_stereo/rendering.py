@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from rimlight import ggx, leds
+from rimlight import ggx, leds, no_collection
 
 from .dataset import Dataset
 from .direct import DirectModel, Guess, bsdf_of, own
@@ -71,8 +71,7 @@ class Domain:
 class Rendering:
     """Renders the images of a data set from a guess and a depth.
 
-    One at a time: with several BSDFs, whose scales are attributes of their meshes, Dr.Jit 1.5 aborts ("invalid
-    redefinition of function"). What became garbage is collected first.
+    What became garbage, such as the one before, is collected first: it may be large.
 
     max_depth : longest path: 2 is direct light, 3 adds one interreflection.
     lights : number of lights that are rendered at a time, the first ones until others are chosen. 0: all.
@@ -252,6 +251,7 @@ class Rendering:
             result["depth"] = (found["vertex_positions"].reshape(-1, 3) * rays).sum(1)
         return result
 
+    @no_collection()
     def visible(self, model: DirectModel) -> np.ndarray:
         """Which lights the surface does not hide from its pixels: (P, K), bool."""
         P, K = model.P, model.K

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 from tqdm import tqdm
 
-from rimlight import ggx
+from rimlight import ggx, no_collection
 from rimlight.edge_sampling.exr import write_exr
 from rimlight.leds import Led, emitters
 from rimlight.loading import one_line
@@ -322,6 +322,7 @@ def _emitters(lights: np.ndarray | tuple[Led, ...]) -> dict:
     return {"lights": {"type": "distant_lights", "directions": mi.TensorXf(lights.astype(np.float32))}}
 
 
+@no_collection()
 def _truth(scene: mi.Scene, N: int, camera: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels that the surface covers, and a little more: (N, N). Mean normals of pixels, (N, N, 3). Depth, (N, N)."""
     at = (np.arange(DETAIL * N) - (DETAIL - 1) / 2) / DETAIL

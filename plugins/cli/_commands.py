@@ -143,7 +143,7 @@ def _accumulate(render: Callable[[int, int], Any], launches: list[tuple[int, int
     total = np.float64(0)
     with _progress(launches, label) as bar:
         for seed, spp in bar:
-            with expected(RuntimeError, pattern=REFUSAL):
+            with expected(RuntimeError, pattern=REFUSAL), rimlight.no_collection():
                 total = total + spp * np.array(render(seed, spp), np.float64)
     image = (total / sum(spp for _, spp in launches)).astype(np.float32)
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
+from rimlight._collection import collect_before, no_collection
 from rimlight._plan import Plan, PlannedTerm, names
 from rimlight.edge_sampling import (
     Batch,
@@ -136,6 +137,12 @@ class EdgeIntegrator(ADIntegrator):
 
     # ---------------------- Mitsuba's interface ----------------------
 
+    @no_collection()
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """The image, as Mitsuba has it."""
+        return super().render(scene, sensor, seed, spp, develop, evaluate)
+
+    @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         """Derivative of the image along the gradients that are set on the parameters.
 
@@ -164,6 +171,7 @@ class EdgeIntegrator(ADIntegrator):
                 values.append(value)
             return self._develop(film, terms, values)
 
+    @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the
         image, makes of them."""
@@ -399,6 +407,7 @@ class EdgeIntegrator(ADIntegrator):
 
     # ---------------------- Plan ----------------------
 
+    @no_collection()
     def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:
         """What a derivative with respect to the parameters that carry a gradient now will do, see `rimlight.plan`."""
         if isinstance(sensor, int):
@@ -460,6 +469,7 @@ class EdgeIntegrator(ADIntegrator):
 
     # ---------------------- What moves ----------------------
 
+    @no_collection()
     def find_boundaries(self, scene, sensor=0) -> Boundaries | None:
         """Find the edges that can contribute to a derivative with respect to the parameters that carry a gradient now.
 
@@ -480,6 +490,9 @@ class EdgeIntegrator(ADIntegrator):
         geometry = Geometry.of(scene)
         if self._geometry is None or self._geometry.key() != geometry.key():
             self._refuse_while_recording()
+            # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
+            self._geometry, self._edges, self._partial, self._boundaries = None, None, None, {}
+            collect_before()
             self._geometry = geometry
             self._edges = find_edges(geometry)
             self._partial = PartialParameters(scene)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from rimlight._collection import no_collection
 from rimlight.edge_sampling import FilmBoundary, FilmPart, Lights, ShadowBoundary, film_parts, stratified
 
 from ._edge_integrator import HARD_SHADOWS, EdgeIntegrator
@@ -119,6 +120,7 @@ class RigIntegrator(EdgeIntegrator):
 
     # ---------------------- Mitsuba's interface ----------------------
 
+    @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The layers: mi.TensorXf, (H, W, 3 K), linear radiance."""
         with dr.suspend_grad():
@@ -130,6 +132,7 @@ class RigIntegrator(EdgeIntegrator):
             paths.trace(Splat(layers), sampler, ray, u, weight / spp, self._choice(sampler, seed))
             return layers.image()
 
+    @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         """Derivative of the layers along the gradients that are set on the parameters.
 
@@ -142,6 +145,7 @@ class RigIntegrator(EdgeIntegrator):
         with dr.suspend_grad():
             return self._differentiate(scene, sensor, seed, spp, None).image()
 
+    @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Add to the gradients of the parameters what `grad_in`, (H, W, 3 K), the gradient of a loss with respect to
         the layers, makes of them."""

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
 import drjit as dr
 import mitsuba as mi
 import normal_cones

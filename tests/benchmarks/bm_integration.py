@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
 import mitsuba as mi
 import numpy as np
 import scipy.sparse as sp

@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
 import mitsuba as mi
 import numpy as np
 from _bench import ROOT, Benchmark, Settings, figure, main, say, table

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
 import mitsuba as mi
 import numpy as np
 from _bench import Benchmark, Settings, main, say, table

@@ -48,11 +48,8 @@ def main(names: list[str]) -> None:
         command = f"python tests/references/make.py {c.name}"
         reference.write(c.reference, {"case": c.name, "command": command})
         noise = reference.standard_error.sum() / abs(reference.mean).sum()
-        # Dr.Jit 1.5 aborts ("invalid redefinition of function") in scripts that load many scenes, unless it forgets
-        # their kernels.
         del scene
         gc.collect()
-        dr.flush_kernel_cache()
         dr.flush_malloc_cache()
         print(f"{c.name}: standard error {noise:.2%} of the L1 norm, {time.time() - start:.0f} s")
 
