@@ -32,6 +32,7 @@ from rimlight.edge_sampling import (
 )
 
 from ._cut_rays import CutRays
+from ._finite import report_gradients, report_image, values_of
 from ._limits import PartialParameters, is_mirror, lets_through
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, met_by, up_to_horizon
@@ -53,11 +54,7 @@ LONG = 16
 
 def _carries_gradient(params) -> bool:
     """Does any of the parameters?"""
-    if not isinstance(params, mi.SceneParameters):
-        return dr.grad_enabled(params)
-    # Not by their names: some (of `hair`) are without a value, at which Mitsuba 3.9 stumbles.
-    values = (mi.get_property(v, kind, node) if kind else v for v, kind, node, _ in params.properties.values())
-    return any(dr.grad_enabled(v) for v in values if v is not None)
+    return any(dr.grad_enabled(v) for v in values_of(params).values())
 
 
 @dataclass
@@ -169,7 +166,9 @@ class EdgeIntegrator(ADIntegrator):
                     value.L += term.throughput * term.replay.forward(first)
                 terms.append(term)
                 values.append(value)
-            return self._develop(film, terms, values)
+            image = self._develop(film, terms, values)
+        report_image(self.name, image)
+        return image
 
     @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -203,6 +202,7 @@ class EdgeIntegrator(ADIntegrator):
                     if term.rays is not None:
                         term.rays.backward()
             dr.eval()
+        report_gradients(self.name, params)
 
     # ---------------------- Radiance ----------------------
 

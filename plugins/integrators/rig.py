@@ -9,6 +9,7 @@ from rimlight._collection import no_collection
 from rimlight.edge_sampling import FilmBoundary, FilmPart, Lights, ShadowBoundary, film_parts, stratified
 
 from ._edge_integrator import HARD_SHADOWS, EdgeIntegrator
+from ._finite import report_gradients, report_image
 from ._layers import Layers, LayerSamples
 from ._light_paths import Backward, Forward, LightPaths, Measure, Splat
 
@@ -143,7 +144,9 @@ class RigIntegrator(EdgeIntegrator):
         if params is not None and not dr.grad_enabled(dict(params)):
             raise RuntimeError(f"{self.name}: none of the parameters carries a gradient")
         with dr.suspend_grad():
-            return self._differentiate(scene, sensor, seed, spp, None).image()
+            image = self._differentiate(scene, sensor, seed, spp, None).image()
+        report_image(self.name, image)
+        return image
 
     @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -152,6 +155,7 @@ class RigIntegrator(EdgeIntegrator):
         with dr.isolate_grad(), dr.suspend_grad():
             self._differentiate(scene, sensor, seed, spp, grad_in)
             dr.eval()
+        report_gradients(self.name, params)
 
     # ---------------------- Derivative ----------------------
 

@@ -1,0 +1,42 @@
+"""The last guard: what an integrator returns is counted if it is not finite, and reported. Nothing is masked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+def values_of(params: Any) -> dict[str, Any]:
+    """The parameters that have a value, by name. A single array has the name "parameter"."""
+    if not isinstance(params, mi.SceneParameters):
+        return {} if params is None else {"parameter": params}
+    # Not by their names: some (of `hair`) are without a value, at which Mitsuba 3.9 stumbles.
+    values = {key: mi.get_property(v, kind, node) if kind else v for key, (v, kind, node, _) in params.properties.items()}
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def report_image(who: str, image: mi.TensorXf) -> None:
+    """Warn if numbers of a derivative image are not finite."""
+    _report(who, {"the derivative image": image})
+
+
+def report_gradients(who: str, params: Any) -> None:
+    """Warn if numbers of the gradients of the parameters are not finite."""
+    values = {key: v for key, v in values_of(params).items() if dr.grad_enabled(v)}
+    _report(who, {f'the gradient of "{key}"': dr.grad(getattr(v, "matrix", v)) for key, v in values.items()})
+
+
+def _report(who: str, arrays: dict[str, Any]) -> None:
+    if dr.flag(dr.JitFlag.FreezingScope) or not arrays:
+        return  # what is recorded cannot be looked at
+    with dr.suspend_grad():
+        bad = {name: dr.count(~dr.isfinite(dr.ravel(a)), axis=None) for name, a in arrays.items()}
+        for name, count in bad.items():
+            if number := int(dr.slice(count)) if dr.is_jit_v(count) else int(count):
+                mi.Log(
+                    mi.LogLevel.Warn,
+                    f"{who}: {number} of {dr.width(dr.ravel(arrays[name]))} numbers of {name} are not finite. This is "
+                    "a defect: please report the scene with its seed. Until it is mended, leave this step out.",
+                )
