@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +33,7 @@ from rimlight.edge_sampling import (
 
 from ._cut_rays import CutRays
 from ._limits import PartialParameters, is_mirror, lets_through
+from ._options import check_options, is_whole
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, met_by, up_to_horizon
 
@@ -115,9 +117,20 @@ class EdgeIntegrator(ADIntegrator):
     edges of the scene.
 
     max_depth, rr_depth : of paths, as in Mitsuba's `path`.
+
+    Raises
+    ------
+    ValueError : a property is not among `OPTIONS`, or has a value that it cannot have.
     """
 
+    #: Names of the properties. Subclasses that have more extend them.
+    OPTIONS: tuple[str, ...] = ("sppc", "sppp", "sppi", "hide_emitters")
+
+    #: Properties that similar plugins have, but this one does not: what to do instead.
+    WITHOUT: ClassVar[dict[str, str]] = {}
+
     def __init__(self, props: mi.Properties, max_depth: int = 2, rr_depth: int = 5):
+        check_options(props, self.OPTIONS, self.WITHOUT)
         super().__init__(props)
         self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
         self.name = props.plugin_name()
@@ -609,7 +622,7 @@ class EdgeIntegrator(ADIntegrator):
 
     def _sample_count(self, props: mi.Properties, key: str) -> int | None:
         value = props.get(key, None)
-        if value is not None and (not isinstance(value, int) or value < 0):
+        if value is not None and (not is_whole(value) or value < 0):
             raise ValueError(f'{self.name}: "{key}" must be a whole number >= 0, got {value}')
         return value
 

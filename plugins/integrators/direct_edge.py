@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import mitsuba as mi
 
 from ._edge_integrator import EdgeIntegrator
@@ -63,6 +65,10 @@ class DirectEdgeIntegrator(EdgeIntegrator):
             'type': 'direct_edge',
             'sppi': 0
     """
+
+    WITHOUT: ClassVar[dict[str, str]] = dict.fromkeys(
+        ("max_depth", "rr_depth"), "Its paths end after direct illumination: leave the property out, or use prb_edge."
+    )
 
     def __init__(self, props: mi.Properties):
         super().__init__(props, max_depth=2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ._edge_integrator import EdgeIntegrator
+from ._options import is_whole
 
 
 class PRBEdgeIntegrator(EdgeIntegrator):
@@ -72,18 +73,16 @@ class PRBEdgeIntegrator(EdgeIntegrator):
             'max_depth': 4
     """
 
+    OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth")
+
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()
         max_depth, rr_depth = props.get("max_depth", 6), props.get("rr_depth", 5)
-        if not _is_whole(max_depth) or max_depth < -1:
+        if not is_whole(max_depth) or max_depth < -1:
             raise ValueError(f'{who}: "max_depth" must be a whole number >= 0, or -1 for no limit, got {max_depth}')
-        if not _is_whole(rr_depth) or rr_depth < 1:
+        if not is_whole(rr_depth) or rr_depth < 1:
             raise ValueError(f'{who}: "rr_depth" must be a whole number >= 1, got {rr_depth}')
         super().__init__(props, max_depth=max_depth, rr_depth=rr_depth)
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
 
 
 mi.register_integrator("prb_edge", PRBEdgeIntegrator)
