@@ -23,8 +23,9 @@ from rimlight.edge_sampling import (
     ShadingBoundary,
     ShadowBoundary,
     Silhouettes,
+    Sources,
     film_parts,
-    find_edges,
+    find_welded_edges,
     has_hard_beam,
     intersecting_meshes,
     jumping_textures,
@@ -139,6 +140,8 @@ class EdgeIntegrator(ADIntegrator):
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         self._geometry: Geometry | None = None
         self._edges: Edges | None = None
+        self._sources: Sources | None = None
+        self._checked = False
         self._partial: PartialParameters | None = None
         self._boundaries: dict[tuple, Boundaries] = {}
         self._warned: set[str] = set()
@@ -486,21 +489,18 @@ class EdgeIntegrator(ADIntegrator):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         with dr.suspend_grad():
-            return self._boundaries_of(scene, sensor, self._override(self.sppi, 0, sensor))
+            boundaries = self._boundaries_of(scene, sensor, self._override(self.sppi, 0, sensor))
+        self._checked = True
+        return boundaries
 
     def _boundaries_of(self, scene, sensor, sppi) -> Boundaries:
         """The edges that can contribute."""
-        geometry = Geometry.of(scene)
-        if self._geometry is None or self._geometry.key() != geometry.key():
-            self._refuse_while_recording()
-            self._geometry = geometry
-            self._edges = find_edges(geometry)
-            self._partial = PartialParameters(scene)
-            self._boundaries = {}
+        geometry, params = Geometry.of(scene), mi.traverse(scene)
+        self._renew(scene, params, geometry)
         with dr.resume_grad():
             for limit in self._partial.limits():
                 self._warn_once(limit)
-            geometry.refuse_moving_others(scene, self.name)
+            geometry.refuse_moving_others(params, self.name)
             moving = geometry.moving()
             camera = mi.traverse(sensor)
             camera_moves = any(dr.grad_enabled(value) for _, value in camera.items())
@@ -521,11 +521,29 @@ class EdgeIntegrator(ADIntegrator):
                 self._warn_once(limit)
             on_film = np.array([m or camera_moves for m in moving], bool)
             film = FilmBoundary(geometry, self._edges, on_film, Lights(scene)) if on_film.any() else None
+            film = film if film is not None and any(film.counts) else None
             shadows, shading = self._light_boundaries(scene, moving, camera_moves or lights_move, sppi)
             self._boundaries[key] = Boundaries(film, shadows, shading, moving, camera_moves, lights_move, limits)
         if self._boundaries[key].shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
             self._boundaries[key].shading.boxes.find_shapes()
         return self._boundaries[key]
+
+    def _renew(self, scene, params, geometry) -> None:
+        """Find the edges, if what they were derived from is no longer the same."""
+        same = self._sources is not None and self._sources.same_objects(scene, params, geometry)
+        if dr.flag(dr.JitFlag.FreezingScope):
+            # It cannot look at arrays: its `state_fn` must have done so, just before.
+            same = same and self._checked
+        else:
+            same, self._checked = same and self._sources.same_content(geometry), False
+        if same:
+            return
+        self._refuse_while_recording()
+        self._geometry = geometry
+        self._edges, weld = find_welded_edges(geometry)
+        self._sources = Sources(scene, params, geometry, self._edges, weld)
+        self._partial = PartialParameters(scene)
+        self._boundaries = {}
 
     def _refuse_while_recording(self) -> None:
         if dr.flag(dr.JitFlag.FreezingScope):
