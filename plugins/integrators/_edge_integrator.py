@@ -513,6 +513,9 @@ class EdgeIntegrator(ADIntegrator):
             )
         if not (camera_moves or lights_move or any(moving)):
             return Boundaries()
+        if not self._checked:
+            # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
+            self._refuse_while_recording()
         key = (moving, camera_moves, lights_move, sppi > 0)
         if key not in self._boundaries:
             self._refuse_while_recording()
@@ -531,10 +534,7 @@ class EdgeIntegrator(ADIntegrator):
     def _renew(self, scene, params, geometry) -> None:
         """Find the edges, if what they were derived from is no longer the same."""
         same = self._sources is not None and self._sources.same_objects(scene, params, geometry)
-        if dr.flag(dr.JitFlag.FreezingScope):
-            # It cannot look at arrays: its `state_fn` must have done so, just before.
-            same = same and self._checked
-        else:
+        if not dr.flag(dr.JitFlag.FreezingScope):
             same, self._checked = same and self._sources.same_content(geometry), False
         if same:
             return
