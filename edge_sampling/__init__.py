@@ -6,7 +6,7 @@ from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
-from .intersections import intersecting_meshes
+from .intersections import intersecting_meshes, t_junctions
 from .lights import Lights, has_hard_beam
 from .meshes import Geometry, jumping_textures, objects_below
 from .motion import Motion, derivative_image
@@ -53,5 +53,6 @@ __all__ = [
     "resample",
     "sample_edge",
     "stratified",
+    "t_junctions",
     "z_scores",
 ]
