@@ -57,8 +57,10 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     what the camera sees, hard ones too, are found from the lights.
 
     **Limits.** Those of ``direct_edge``, but for interreflections; what perfect mirrors and glass show is taken not to
-    move, and part of what is seen through masks, with a warning. In corners of rooms, the derivative with respect to
-    the camera has infinite variance: it is right in the mean, and noisy. Participating media are not supported.
+    move, and part of what is seen through masks, with a warning. Where something that moves touches something else,
+    and in corners of rooms when the camera moves, light that bounces between the two has a derivative of infinite
+    variance; for some of these integrals, not even the mean of the absolute value is finite. There, single pixels are
+    wrong by arbitrary amounts, and more samples help slowly or not at all.
 
     .. tabs::
         .. code-tab:: xml
