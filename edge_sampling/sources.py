@@ -20,7 +20,8 @@ from .meshes import Geometry, has_interpolated_normals, vertex_attributes
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
 APART = 64
 
-#: And by more than so many times what was tolerated when they were welded, so that welding again would not join them.
+#: And if they differed then, by more than so many times that, and what was tolerated: those that would be welded again
+#: are not to be found apart.
 HYSTERESIS = 4
 
 
@@ -50,18 +51,19 @@ class Sources:
             for (i, name), array in self._held.items()
             if i in self._seams and name not in ("faces", "positions")
         }
-        first = weld.first
+        dr.eval(self._differing)
+        #: Vertices at different places, and pairs at the same place.
+        first, place = weld.first, weld.place
         self._first = _index(first)
         self._pairs: tuple[mi.UInt32, mi.UInt32] | None = None
-        if len(first) < len(weld.place):
-            others = np.setdiff1d(np.arange(len(weld.place)), first, assume_unique=True)
+        if len(first) < len(place):
+            others = np.setdiff1d(np.arange(len(place)), first)
+            self._pairs = _index(others), _index(first[place[others]])
             p = geometry.host_positions()
-            others, same = others, first[weld.place[others]]
-            self._pairs = _index(others), _index(same)
-            close = (p[others] != p[same]).any(1)
+            distance = np.linalg.norm(p[others] - p[first[place[others]]], axis=1)
+            tolerance = np.where(distance > 0, HYSTERESIS * np.maximum(distance, weld.tolerance), 0)
             #: How far apart each pair may be, whatever the rounding error: scene units.
-            self._tolerance = mi.Float(np.where(close, HYSTERESIS * weld.tolerance, 0).astype(np.float32))
-        dr.eval(self._differing)
+            self._tolerance = mi.Float(tolerance.astype(np.float32))
 
     def same_objects(self, scene: mi.Scene, params: mi.SceneParameters, geometry: Geometry) -> bool:
         """Are there the same shapes, of the same size, with the same materials and lights? Asks the host alone."""
@@ -73,7 +75,8 @@ class Sources:
     def same_content(self, geometry: Geometry) -> bool:
         """Are the faces the same, and which vertices lie at the same place, and where attributes differ between those?
 
-        Reads one bit from the device, or nothing if no array was replaced. Not in frozen functions.
+        Reads one bit from the device, or nothing if no array was replaced. (Where one was, Mitsuba has just waited for
+        the device, to find the bounding box.) Not in frozen functions.
         """
         new = self._arrays(geometry)
         replaced = [key for key, array in new.items() if array.index != self._held[key].index]
@@ -147,10 +150,10 @@ def _coincide(positions: mi.Float, vertices: mi.UInt32) -> mi.Bool:
 
 
 def _objects(scene: mi.Scene, params: mi.SceneParameters, geometry: Geometry) -> tuple[list[Any], list[Any]]:
-    """All shapes, materials, textures and lights; and the numbers that tell what they are."""
+    """All shapes, materials, textures, lights and media; and the numbers that tell what they are."""
     shapes, emitters = scene.shapes(), scene.emitters()
     bsdfs = [s.bsdf() for s in shapes]
-    kinds = (mi.Shape, mi.BSDF, mi.Emitter, mi.Texture)
+    kinds = (mi.Shape, mi.BSDF, mi.Emitter, mi.Texture, mi.Medium)
     nodes = [node for _, _, node, _ in params.properties.values() if isinstance(node, kinds)]
     numbers = [(m.vertex_count(), m.face_count(), has_interpolated_normals(m)) for m in geometry.meshes]
     numbers += [b.flags() for b in bsdfs if b is not None]
