@@ -162,25 +162,27 @@ def objects_below(root: mi.Object) -> dict[str, Any]:
     found = {"": root}
     seen = {id(root)}
 
+    # A class is garbage that refers to itself, which only Python's collector frees: it must not hold the objects, since
+    # Dr.Jit 1.5 may abort if those of a scene are freed while another one is traced.
     class Children(mi.TraversalCallback):
-        def __init__(self, parent: str):
+        def __init__(self, parent: str, found: dict[str, Any], seen: set[int]):
             super().__init__()
-            self.parent = parent
+            self.parent, self.found, self.seen = parent, found, seen
 
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            if isinstance(value, mi.Object) and id(value) not in seen:
-                seen.add(id(value))
+            if isinstance(value, mi.Object) and id(value) not in self.seen:
+                self.seen.add(id(value))
                 key = f"{self.parent}.{value.id() if isinstance(value, mi.Shape) else name}".lstrip(".")
-                while key in found:
+                while key in self.found:
                     key += "'"
-                found[key] = value
+                self.found[key] = value
 
         put_value = put_object = put
 
     queue = [""]
     for name in queue:  # grows as it goes
         before = len(found)
-        found[name].traverse(Children(name))
+        found[name].traverse(Children(name, found, seen))
         queue += list(found)[before:]
     return found
 

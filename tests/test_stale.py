@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import sys
+
 import cases
 import drjit as dr
 import mitsuba as mi
@@ -283,3 +286,20 @@ def test_frozen_function_that_cannot_know_is_refused():
     while cause.__cause__ is not None:
         cause = cause.__cause__
     assert "state_fn" in str(cause) and "find_boundaries" in str(cause)
+
+
+# ---------------------- What is held ----------------------
+
+
+def test_derivatives_do_not_hold_the_scene(make):
+    """Nor does garbage that only Python's collector frees: Dr.Jit may abort if that frees a scene while it traces."""
+    scene, used = two_quads(), make()
+    gc.collect()
+    gc.disable()
+    try:
+        before = sys.getrefcount(scene)
+        derivative(scene, used, "right.vertex_positions")
+        used.plan(scene)
+        assert sys.getrefcount(scene) == before
+    finally:
+        gc.enable()
