@@ -3,10 +3,10 @@
 from .batch import Batch, FilmPart, film_parts
 from .edge_importance import Cone, EdgeSample, Lobe, View, resample, sample_edge, stratified
 from .edge_tree import EdgeTree
-from .edges import EdgeKind, Edges, find_edges
+from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
-from .intersections import intersecting_meshes
+from .intersections import intersecting_meshes, t_junctions
 from .lights import Lights, has_hard_beam
 from .meshes import Geometry, jumping_textures, objects_below
 from .motion import Motion, derivative_image
@@ -14,6 +14,7 @@ from .projection import Projection
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary, ShadowSamples
 from .silhouettes import Silhouettes
+from .sources import Sources
 from .zscores import mean_and_error, z_scores
 
 __all__ = [
@@ -36,10 +37,13 @@ __all__ = [
     "ShadowBoundary",
     "ShadowSamples",
     "Silhouettes",
+    "Sources",
     "View",
+    "Weld",
     "derivative_image",
     "film_parts",
     "find_edges",
+    "find_welded_edges",
     "finite_differences",
     "has_hard_beam",
     "intersecting_meshes",
@@ -49,5 +53,6 @@ __all__ = [
     "resample",
     "sample_edge",
     "stratified",
+    "t_junctions",
     "z_scores",
 ]

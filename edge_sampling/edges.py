@@ -74,7 +74,29 @@ class Edges:
         return {"edges": len(self), "open": int(self.open.sum()), **{k.name.lower(): int(counts[k]) for k in EdgeKind}}
 
 
+@dataclass(frozen=True)
+class Weld:
+    """Which vertices were at the same place when the edges were found, on the host.
+
+    place : (V,), int64; number of the place of each vertex of `Geometry.positions`.
+    tolerance : how far apart vertices at one place may be, scene units.
+    """
+
+    place: np.ndarray
+    tolerance: float
+
+    @property
+    def first(self) -> np.ndarray:
+        """The first vertex at each place: (P,), int64."""
+        return np.unique(self.place, return_index=True)[1]
+
+
 def find_edges(geometry: Geometry) -> Edges:
+    """Find and classify the edges of all meshes, as one welded whole: `find_welded_edges`, the edges alone."""
+    return find_welded_edges(geometry)[0]
+
+
+def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     """Find and classify the edges of all meshes, as one welded whole.
 
     Welding over the borders of meshes makes one edge of two that coincide, as where the walls of a room meet: sampled
@@ -97,7 +119,7 @@ def find_edges(geometry: Geometry) -> Edges:
         values.append(meshes.vertex_values(mesh))
         offset += len(v)
     if not points:
-        return _no_edges()
+        return _no_edges(), Weld(np.zeros(0, np.int64), 0.0)
     face, mesh_of_face = np.concatenate(face_list), np.concatenate(mesh_of_face)
     point = np.concatenate(points)
     width = max(t.shape[1] for t in values)
@@ -106,7 +128,7 @@ def find_edges(geometry: Geometry) -> Edges:
     weld = _weld_equal(point)
     sides = _pair_sides(weld, face)
     # Coordinates that went through different transformations differ in their last bits; open edges alone can show it.
-    rewelded = _weld_close(point, weld, face, sides)
+    rewelded, tolerance = _weld_close(point, weld, face, sides)
     if rewelded is not weld:
         weld, sides = rewelded, _pair_sides(rewelded, face)
 
@@ -126,13 +148,14 @@ def find_edges(geometry: Geometry) -> Edges:
     kind[split] = EdgeKind.SPLIT
     kind[~interpolated[mesh0]] = EdgeKind.FLAT
     kind[(count != 2) | (mesh0 != mesh1) | seam | everywhere[mesh0]] = EdgeKind.JUMP
-    return Edges(
+    edges = Edges(
         vertices=np.stack([np.stack([i0, j0], 1), np.stack([i1, j1], 1)], 1).astype(np.uint32),
         opposite=np.stack([o0, o1], 1).astype(np.uint32),
         mesh=np.stack([mesh0, mesh1], 1),
         kind=kind,
         count=count.astype(np.uint32),
     )
+    return edges, Weld(weld, tolerance)
 
 
 def _no_edges() -> Edges:
@@ -163,23 +186,25 @@ def _mix(rows: np.ndarray) -> np.ndarray:
     )
 
 
-def _weld_close(point: np.ndarray, weld: np.ndarray, face: np.ndarray, sides: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Join the welded vertices of open edges that are closer than single precision can tell apart."""
+def _weld_close(
+    point: np.ndarray, weld: np.ndarray, face: np.ndarray, sides: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, float]:
+    """Join the welded vertices of open edges that are closer than single precision can tell apart. Also how close."""
     face0, corner0, _, _, count = sides
     lone = count == 1
     ends = np.concatenate([face[face0[lone], corner0[lone]], face[face0[lone], (corner0[lone] + 1) % 3]])
     if len(ends) == 0:
-        return weld
+        return weld, 0.0
     _, representative = np.unique(weld[ends], return_index=True)
     vertex = ends[representative]
     tolerance = 8 * np.finfo(np.float32).eps * max(np.abs(point[vertex]).max(), np.finfo(np.float32).tiny)
     pairs = cKDTree(point[vertex]).query_pairs(tolerance, output_type="ndarray")
     if len(pairs) == 0:
-        return weld
+        return weld, 0.0
     a, b = weld[vertex[pairs[:, 0]]], weld[vertex[pairs[:, 1]]]
     n = int(weld.max()) + 1
     _, group = connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n)), directed=False)
-    return group[weld].astype(np.int64)
+    return group[weld].astype(np.int64), float(tolerance)
 
 
 def _pair_sides(weld: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, ...]:

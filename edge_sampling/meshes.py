@@ -32,11 +32,6 @@ class Geometry:
         analytic = tuple(s for s in shapes if s.class_name() in CURVES)
         return Geometry(meshes, analytic, tuple(s for s in shapes if s not in meshes and s not in analytic))
 
-    def key(self) -> tuple[tuple[int, int, int], ...]:
-        """What must stay the same for the edges found earlier to be valid: which meshes there are, and their sizes."""
-        meshes = tuple((int(m.ptr), m.vertex_count(), m.face_count()) for m in self.meshes)
-        return meshes + tuple((int(s.ptr), 0, 0) for s in self.analytic)
-
     def faces(self, wanted: tuple[bool, ...]) -> np.ndarray:
         """Faces of the meshes that are `wanted`: (F, 3), indices into `positions`, on the host."""
         offsets = np.cumsum([0, *(m.vertex_count() for m in self.meshes)])
@@ -48,15 +43,16 @@ class Geometry:
         meshes = tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
         return meshes + tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
 
-    def refuse_moving_others(self, scene: mi.Scene, who: str) -> None:
+    def refuse_moving_others(self, params: mi.SceneParameters, who: str) -> None:
         """Refuse derivatives with respect to shapes whose silhouettes are not known, inside of shape groups, too.
+
+        params : of the scene.
 
         Raises
         ------
         RuntimeError : one of `others`, or a shape in a group, carries a gradient in one of its own parameters.
         """
         known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
-        params = mi.traverse(scene)
         for key, (_, _, node, _) in params.properties.items():
             if isinstance(node, mi.Shape) and int(node.ptr) not in known and dr.grad_enabled(params[key]):
                 raise RuntimeError(
@@ -105,10 +101,15 @@ def texture_coordinates(mesh: Any) -> np.ndarray:
 def vertex_values(mesh: Any) -> np.ndarray:
     """What a mesh interpolates between its vertices besides normals, texture coordinates and attributes: (V, K), on the
     host, detached."""
+    attributes = [np.array(values).reshape(mesh.vertex_count(), -1) for values in vertex_attributes(mesh).values()]
+    return np.concatenate([texture_coordinates(mesh), *attributes], axis=1)
+
+
+def vertex_attributes(mesh: Any) -> dict[str, mi.Float]:
+    """Attributes of the vertices of a mesh, by name: each (K V,), detached."""
     known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
     names = [k for k in mi.traverse(mesh).properties if k.startswith("vertex_") and k not in known]
-    attributes = [np.array(dr.detach(mesh.attribute_buffer(k))).reshape(mesh.vertex_count(), -1) for k in names]
-    return np.concatenate([texture_coordinates(mesh), *attributes], axis=1)
+    return {name: dr.detach(mesh.attribute_buffer(name)) for name in names}
 
 
 def has_interpolated_normals(mesh: Any) -> bool:
@@ -161,25 +162,27 @@ def objects_below(root: mi.Object) -> dict[str, Any]:
     found = {"": root}
     seen = {id(root)}
 
+    # A class is garbage that refers to itself, which only Python's collector frees: it must not hold the objects, since
+    # Dr.Jit 1.5 may abort if those of a scene are freed while another one is traced.
     class Children(mi.TraversalCallback):
-        def __init__(self, parent: str):
+        def __init__(self, parent: str, found: dict[str, Any], seen: set[int]):
             super().__init__()
-            self.parent = parent
+            self.parent, self.found, self.seen = parent, found, seen
 
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            if isinstance(value, mi.Object) and id(value) not in seen:
-                seen.add(id(value))
+            if isinstance(value, mi.Object) and id(value) not in self.seen:
+                self.seen.add(id(value))
                 key = f"{self.parent}.{value.id() if isinstance(value, mi.Shape) else name}".lstrip(".")
-                while key in found:
+                while key in self.found:
                     key += "'"
-                found[key] = value
+                self.found[key] = value
 
         put_value = put_object = put
 
     queue = [""]
     for name in queue:  # grows as it goes
         before = len(found)
-        found[name].traverse(Children(name))
+        found[name].traverse(Children(name, found, seen))
         queue += list(found)[before:]
     return found
 

@@ -4,7 +4,8 @@ references."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,26 @@ class Case:
     @property
     def reference(self) -> Path:
         return REFERENCES / f"{self.name}.exr"
+
+
+@contextmanager
+def messages() -> Iterator[list[str]]:
+    """What is written to Mitsuba's log meanwhile."""
+    found = []
+
+    class Collect(mi.Appender):
+        def append(self, level, text):
+            found.append(text)
+
+        def log_progress(self, *args):
+            pass
+
+    appender, logger = Collect(), mi.logger()
+    logger.add_appender(appender)
+    try:
+        yield found
+    finally:
+        logger.remove_appender(appender)
 
 
 # ---------------------- Building blocks ----------------------

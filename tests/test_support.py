@@ -724,8 +724,8 @@ def material(make: Callable[[], dict], text: str, deep: bool = False) -> Message
     return Message(lambda folder: {"thing": sheet("thing", np.array([0, 0, 1]), make())}, text, deep=deep)
 
 
-def still(make: Callable[[], dict], moves: str) -> Message:
-    return Message(lambda folder: {"thing": make()}, SILHOUETTES, moves)
+def still(make: Callable[[], dict], moves: str, text: str = SILHOUETTES) -> Message:
+    return Message(lambda folder: {"thing": make()}, text, moves)
 
 
 def in_lamp(kind: str, text: str) -> Message:
@@ -756,6 +756,7 @@ MIRROR, THROUGH, JUMPS = "what perfect mirrors and glass show", "what shines, th
 POLARISERS = ("polarizer", "retarder", "circular")
 
 #: By row, what is said when it moves, and when it is passed.
+#: By row, or by row and column where the columns differ.
 MESSAGES = {
     "`bsplinecurve`, `linearcurve`": [
         Message(
@@ -766,6 +767,7 @@ MESSAGES = {
         ),
     ],
     "`sdfgrid`": [still(signed_distances, "thing.grid")],
+    ("`sdfgrid`", "passed"): [still(signed_distances, "", 'at the silhouettes of "thing"')],
     "`ellipsoids`, `ellipsoidsmesh`": [
         still(lambda: ellipsoids("ellipsoids"), "thing.data"),
         still(lambda: ellipsoids("ellipsoidsmesh"), "thing.data"),
@@ -829,8 +831,8 @@ ELSEWHERE = {
 SAID = [
     pytest.param(message, column, id=f"{row} {column} {i}")
     for (row, column), text in ROWS.items()
-    if text.startswith(("warned", "refused")) and column != "changes" and row in MESSAGES
-    for i, message in enumerate(MESSAGES[row])
+    if text.startswith(("warned", "refused")) and column != "changes"
+    for i, message in enumerate(MESSAGES.get((row, column), MESSAGES.get(row, ())))
 ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -23,17 +24,20 @@ from rimlight.edge_sampling import (
     ShadingBoundary,
     ShadowBoundary,
     Silhouettes,
+    Sources,
     film_parts,
-    find_edges,
+    find_welded_edges,
     has_hard_beam,
     intersecting_meshes,
     jumping_textures,
     stratified,
+    t_junctions,
 )
 
 from ._cut_rays import CutRays
 from ._finite import report_gradients, report_image, values_of
-from ._limits import PartialParameters, is_mirror, lets_through
+from ._limits import Media, PartialParameters, beyond_far_plane, is_mirror, lets_through
+from ._options import check_options, is_whole
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, met_by, up_to_horizon
 
@@ -113,9 +117,20 @@ class EdgeIntegrator(ADIntegrator):
     edges of the scene.
 
     max_depth, rr_depth : of paths, as in Mitsuba's `path`.
+
+    Raises
+    ------
+    ValueError : a property is not among `OPTIONS`, or has a value that it cannot have.
     """
 
+    #: Names of the properties. Subclasses that have more extend them.
+    OPTIONS: tuple[str, ...] = ("sppc", "sppp", "sppi", "hide_emitters")
+
+    #: Properties that similar plugins have, but this one does not: what to do instead.
+    WITHOUT: ClassVar[dict[str, str]] = {}
+
     def __init__(self, props: mi.Properties, max_depth: int = 2, rr_depth: int = 5):
+        check_options(props, self.OPTIONS, self.WITHOUT)
         super().__init__(props)
         self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
         self.name = props.plugin_name()
@@ -124,7 +139,11 @@ class EdgeIntegrator(ADIntegrator):
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         self._geometry: Geometry | None = None
         self._edges: Edges | None = None
+        self._sources: Sources | None = None
+        self._checked = False
         self._partial: PartialParameters | None = None
+        self._media: Media | None = None
+        self._beyond: dict[tuple, tuple[mi.Sensor, list[str]]] = {}
         self._boundaries: dict[tuple, Boundaries] = {}
         self._warned: set[str] = set()
 
@@ -483,24 +502,18 @@ class EdgeIntegrator(ADIntegrator):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         with dr.suspend_grad():
-            return self._boundaries_of(scene, sensor, self._override(self.sppi, 0, sensor))
+            boundaries = self._boundaries_of(scene, sensor, self._override(self.sppi, 0, sensor))
+        self._checked = True
+        return boundaries
 
     def _boundaries_of(self, scene, sensor, sppi) -> Boundaries:
         """The edges that can contribute."""
-        geometry = Geometry.of(scene)
-        if self._geometry is None or self._geometry.key() != geometry.key():
-            self._refuse_while_recording()
-            # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
-            self._geometry, self._edges, self._partial, self._boundaries = None, None, None, {}
-            collect_before()
-            self._geometry = geometry
-            self._edges = find_edges(geometry)
-            self._partial = PartialParameters(scene)
-            self._boundaries = {}
+        geometry, params = Geometry.of(scene), mi.traverse(scene)
+        self._renew(scene, params, geometry)
         with dr.resume_grad():
-            for limit in self._partial.limits():
-                self._warn_once(limit)
-            geometry.refuse_moving_others(scene, self.name)
+            self._media.refuse_gradients(self.name)
+            limits = (*self._media.limits(), *self._partial.limits())
+            geometry.refuse_moving_others(params, self.name)
             moving = geometry.moving()
             camera = mi.traverse(sensor)
             camera_moves = any(dr.grad_enabled(value) for _, value in camera.items())
@@ -512,20 +525,43 @@ class EdgeIntegrator(ADIntegrator):
                 "Replace them by meshes."
             )
         if not (camera_moves or lights_move or any(moving)):
-            return Boundaries()
+            self._warn_once(*limits)
+            return Boundaries(limits=limits)
+        if not self._checked:
+            # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
+            self._refuse_while_recording()
         key = (moving, camera_moves, lights_move, sppi > 0)
         if key not in self._boundaries:
             self._refuse_while_recording()
-            limits = self._limits(scene, moving, camera_moves, lights_move, sppi)
-            for limit in limits:
-                self._warn_once(limit)
             on_film = np.array([m or camera_moves for m in moving], bool)
             film = FilmBoundary(geometry, self._edges, on_film, Lights(scene)) if on_film.any() else None
+            film = film if film is not None and any(film.counts) else None
             shadows, shading = self._light_boundaries(scene, moving, camera_moves or lights_move, sppi)
-            self._boundaries[key] = Boundaries(film, shadows, shading, moving, camera_moves, lights_move, limits)
-        if self._boundaries[key].shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
-            self._boundaries[key].shading.boxes.find_shapes()
-        return self._boundaries[key]
+            lasting = self._limits(scene, moving, camera_moves, lights_move, sppi)
+            self._boundaries[key] = Boundaries(film, shadows, shading, moving, camera_moves, lights_move, lasting)
+        boundaries = self._boundaries[key]
+        if boundaries.shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
+            boundaries.shading.boxes.find_shapes()
+        limits += (*boundaries.limits, *self._limits_of_sensor(sensor, moving, camera_moves))
+        self._warn_once(*limits)
+        return replace(boundaries, limits=limits)
+
+    def _renew(self, scene, params, geometry) -> None:
+        """Find the edges, if what they were derived from is no longer the same."""
+        same = self._sources is not None and self._sources.same_objects(scene, params, geometry)
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            same, self._checked = same and self._sources.same_content(geometry), False
+        if same:
+            return
+        self._refuse_while_recording()
+        # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
+        self._geometry = self._edges = self._sources = self._partial = self._media = None
+        self._boundaries, self._beyond = {}, {}
+        collect_before()
+        self._geometry = geometry
+        self._edges, weld = find_welded_edges(geometry)
+        self._sources = Sources(scene, params, geometry, self._edges, weld)
+        self._partial, self._media = PartialParameters(scene), Media(scene)
 
     def _refuse_while_recording(self) -> None:
         if dr.flag(dr.JitFlag.FreezingScope):
@@ -603,6 +639,12 @@ class EdgeIntegrator(ADIntegrator):
                 f"the derivative lacks the shadows and reflections of {', '.join(casts)} on what moves, or in moving "
                 "light: their silhouettes are unknown. Replace them by meshes."
             )
+        grids = names(s for s in scene.shapes() if s.class_name() == "SDFGrid")
+        if grids:
+            limits.append(
+                f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid). Replace "
+                "them by meshes."
+            )
         cut = {
             (geometry.meshes[i].id(), geometry.meshes[j].id())
             for i, j in intersecting_meshes(scene, geometry, self._edges)
@@ -611,18 +653,41 @@ class EdgeIntegrator(ADIntegrator):
         if cut:
             pairs = ", ".join(f'"{a}" and "{b}"' for a, b in sorted(cut))
             limits.append(f"the derivative lacks the lines in which meshes cut through each other: {pairs}.")
+        # Of edges that lie on one another, those of what stands still have no velocity, and do not count.
+        twice = sorted(
+            (geometry.meshes[i].id(), geometry.meshes[j].id())
+            for i, j in (t_junctions(geometry, self._edges) if any(moving) or camera_moves else ())
+            if camera_moves or (moving[i] and moving[j])
+        )
+        if twice:
+            pairs = ", ".join(f'"{a}"' if a == b else f'"{a}" and "{b}"' for a, b in twice)
+            limits.append(
+                "the derivative counts the jump at T-junctions twice, where a vertex lies inside of an open edge: "
+                f"{pairs}. Divide the longer edges there."
+            )
         return tuple(limits)
 
-    def _warn_once(self, message: str) -> None:
-        if message not in self._warned:
-            self._warned.add(message)
-            mi.Log(mi.LogLevel.Warn, f"{self.name}: {message}")
+    def _limits_of_sensor(self, sensor, moving, camera_moves) -> list[str]:
+        """What the derivative will lack as seen from this sensor. Found once, since it looks at positions."""
+        key = (id(sensor), moving, camera_moves)
+        if key not in self._beyond and not dr.flag(dr.JitFlag.FreezingScope):
+            shapes = zip((*self._geometry.meshes, *self._geometry.analytic), moving, strict=True)
+            # With the sensor, so that its number is given to no other one.
+            found = beyond_far_plane(sensor, [s for s, moves in shapes if moves or camera_moves])
+            self._beyond[key] = sensor, found
+        return self._beyond[key][1] if key in self._beyond else []
+
+    def _warn_once(self, *messages: str) -> None:
+        for message in messages:
+            if message not in self._warned:
+                self._warned.add(message)
+                mi.Log(mi.LogLevel.Warn, f"{self.name}: {message}")
 
     # ---------------------- Sample counts ----------------------
 
     def _sample_count(self, props: mi.Properties, key: str) -> int | None:
         value = props.get(key, None)
-        if value is not None and (not isinstance(value, int) or value < 0):
+        if value is not None and (not is_whole(value) or value < 0):
             raise ValueError(f'{self.name}: "{key}" must be a whole number >= 0, got {value}')
         return value
 

@@ -13,7 +13,8 @@ def values_of(params: Any) -> dict[str, Any]:
     if not isinstance(params, mi.SceneParameters):
         return {} if params is None else {"parameter": params}
     # Not by their names: some (of `hair`) are without a value, at which Mitsuba 3.9 stumbles.
-    values = {key: mi.get_property(v, kind, node) if kind else v for key, (v, kind, node, _) in params.properties.items()}
+    rows = params.properties.items()
+    values = {key: mi.get_property(value, kind, node) if kind else value for key, (value, kind, node, _) in rows}
     return {key: value for key, value in values.items() if value is not None}
 
 
@@ -32,11 +33,13 @@ def _report(who: str, arrays: dict[str, Any]) -> None:
     if dr.flag(dr.JitFlag.FreezingScope) or not arrays:
         return  # what is recorded cannot be looked at
     with dr.suspend_grad():
-        bad = {name: dr.count(~dr.isfinite(dr.ravel(a)), axis=None) for name, a in arrays.items()}
-        for name, count in bad.items():
-            if number := int(dr.slice(count)) if dr.is_jit_v(count) else int(count):
+        arrays = {name: dr.ravel(a) for name, a in arrays.items()}
+        counts = {name: dr.count(~dr.isfinite(a)) for name, a in arrays.items()}
+        for name, count in counts.items():
+            if count[0]:
                 mi.Log(
                     mi.LogLevel.Warn,
-                    f"{who}: {number} of {dr.width(dr.ravel(arrays[name]))} numbers of {name} are not finite. This is "
-                    "a defect: please report the scene with its seed. Until it is mended, leave this step out.",
+                    f"{who}: {count[0]} of {dr.width(arrays[name])} numbers of {name} are not finite. This is a defect "
+                    "of the integrator, unless the scene or the loss hold such numbers: please report it, with scene "
+                    "and seed. Another seed may help until then.",
                 )

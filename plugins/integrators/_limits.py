@@ -6,8 +6,11 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from rimlight.edge_sampling import objects_below
+from rimlight._plan import names
+from rimlight.edge_sampling import film_parts, objects_below
+from rimlight.edge_sampling.meshes import vertices
 
 #: What perfect mirrors and glass do.
 MIRRORS = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
@@ -62,3 +65,66 @@ class PartialParameters:
         return [
             f"the derivative lacks part of what {c} does, since Mitsuba does not differentiate it." for c in changing
         ]
+
+
+class Media:
+    """The participating media of a scene. Paths go through them as if they were empty."""
+
+    def __init__(self, scene: mi.Scene):
+        self.found = {name: o for name, o in objects_below(scene).items() if isinstance(o, mi.Medium)}
+
+    def limits(self) -> list[str]:
+        listed = ", ".join(f'"{name}" ({o.class_name()})' for name, o in self.found.items())
+        lacking = (
+            f"image and derivative take the participating media {listed} for empty; remove them, or use Mitsuba's "
+            "prbvolpath, which differentiates media, but not the visibility of surfaces."
+        )
+        return [lacking] if listed else []
+
+    def refuse_gradients(self, who: str) -> None:
+        """Refuse derivatives with respect to parameters of media.
+
+        Raises
+        ------
+        RuntimeError : one of them carries a gradient.
+        """
+        for name, medium in self.found.items():
+            params = mi.traverse(medium)
+            for key in params.properties:
+                if dr.grad_enabled(params[key]):
+                    raise RuntimeError(
+                        f'{who}: "{name}.{key}" ({medium.class_name()}) carries a gradient, but participating media '
+                        "are not supported. Detach it, or use Mitsuba's prbvolpath."
+                    )
+
+
+def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
+    """What the derivative lacks where the far clipping plane of a sensor cuts through shapes.
+
+    shapes : those that move as seen from the sensor.
+    """
+    limits = []
+    for part in film_parts(sensor):
+        if not hasattr(part.sensor, "far_clip"):
+            continue
+        far, to_local = part.sensor.far_clip(), dr.detach(part.sensor.world_transform()).inverse().matrix
+        axis = np.array([to_local[2, k] for k in range(4)], np.float64).ravel()
+        cut = [s for s in shapes if _crosses(s, axis, far)]
+        if cut:
+            limits.append(
+                f'the derivative lacks the cut of the far clipping plane of "{part.sensor.id()}" through '
+                f"{', '.join(names(cut))}; increase its far_clip, now {far:g}."
+            )
+    return limits
+
+
+def _crosses(shape: mi.Shape, axis: np.ndarray, depth: float) -> bool:
+    """Are there points of a shape on both sides of a plane? axis : (4,), maps points to depths."""
+    box = shape.bbox()
+    bounds = np.stack([np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()])
+    corners = np.stack(np.meshgrid(*bounds.T), -1).reshape(-1, 3)
+    sides = corners @ axis[:3] + axis[3] > depth
+    if sides.all() or not sides.any() or not shape.is_mesh():
+        return bool(sides.any() and not sides.all())
+    sides = vertices(shape).astype(np.float64) @ axis[:3] + axis[3] > depth
+    return bool(sides.any() and not sides.all())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import mitsuba as mi
 
 from ._edge_integrator import EdgeIntegrator
@@ -45,11 +47,13 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     **Limits.** Only triangle meshes, spheres, disks and cylinders can move: a moving hair, instance, ... is
     refused, and so is a camera that moves past one. Missing, with a warning: the motion of what perfect mirrors and
     glass show, the jumps of textures (``checkerboard``, ``nearest`` filters) and of the slopes of bump maps, the
-    lines in which meshes cut through each other, the borders of hard beams, and shadows of hair, instances, ... on
-    what moves. At the outline of a smooth-shaded mesh, the dark fringe of normals that face away is taken as
-    infinitely thin (see the theory), which leaves a bias of the order of its width: about 2 % on a torus of 48 × 24
-    quads at 32². Polarised variants are refused. With filters other than ``box``, the ratio of sums that makes a
-    pixel has a bias of order 1/spp, as it has in the image.
+    lines in which meshes cut through each other, or the far clipping plane through them, the borders of hard beams,
+    and shadows of hair, instances, ... on what moves. Warned about, too: jumps at T-junctions, which count twice,
+    and participating media, which are taken for empty (derivatives with respect to their parameters are refused).
+    At the outline of a smooth-shaded mesh, the dark fringe of normals that face away is taken as infinitely thin
+    (see the theory), which leaves a bias of the order of its width: about 2 % on a torus of 48 × 24 quads at 32².
+    Polarised variants are refused. With filters other than ``box``, the ratio of sums that makes a pixel has a bias
+    of order 1/spp, as it has in the image.
 
     .. tabs::
         .. code-tab:: xml
@@ -63,6 +67,10 @@ class DirectEdgeIntegrator(EdgeIntegrator):
             'type': 'direct_edge',
             'sppi': 0
     """
+
+    WITHOUT: ClassVar[dict[str, str]] = dict.fromkeys(
+        ("max_depth", "rr_depth"), "Its paths end after direct illumination: leave the property out, or use prb_edge."
+    )
 
     def __init__(self, props: mi.Properties):
         super().__init__(props, max_depth=2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ._edge_integrator import EdgeIntegrator
+from ._options import is_whole
 
 
 class PRBEdgeIntegrator(EdgeIntegrator):
@@ -56,8 +57,10 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     what the camera sees, hard ones too, are found from the lights.
 
     **Limits.** Those of ``direct_edge``, but for interreflections; what perfect mirrors and glass show is taken not to
-    move, and part of what is seen through masks, with a warning. In corners of rooms, the derivative with respect to
-    the camera has infinite variance: it is right in the mean, and noisy. Participating media are not supported.
+    move, and part of what is seen through masks, with a warning. Where something that moves touches something else,
+    and in corners of rooms when the camera moves, light that bounces between the two has a derivative of infinite
+    variance; for some of these integrals, not even the mean of the absolute value is finite. There, single pixels are
+    wrong by arbitrary amounts, and more samples help slowly or not at all.
 
     .. tabs::
         .. code-tab:: xml
@@ -72,18 +75,16 @@ class PRBEdgeIntegrator(EdgeIntegrator):
             'max_depth': 4
     """
 
+    OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth")
+
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()
         max_depth, rr_depth = props.get("max_depth", 6), props.get("rr_depth", 5)
-        if not _is_whole(max_depth) or max_depth < -1:
+        if not is_whole(max_depth) or max_depth < -1:
             raise ValueError(f'{who}: "max_depth" must be a whole number >= 0, or -1 for no limit, got {max_depth}')
-        if not _is_whole(rr_depth) or rr_depth < 1:
+        if not is_whole(rr_depth) or rr_depth < 1:
             raise ValueError(f'{who}: "rr_depth" must be a whole number >= 1, got {rr_depth}')
         super().__init__(props, max_depth=max_depth, rr_depth=rr_depth)
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
 
 
 mi.register_integrator("prb_edge", PRBEdgeIntegrator)

@@ -12,6 +12,7 @@ from ._edge_integrator import HARD_SHADOWS, EdgeIntegrator
 from ._finite import report_gradients, report_image
 from ._layers import Layers, LayerSamples
 from ._light_paths import Backward, Forward, LightPaths, Measure, Splat
+from ._options import is_whole
 
 SHADOWS_ON_FILM = (
     "the derivative has the shadows that lights throw on what the camera sees, but lacks those of the environment and "
@@ -108,6 +109,8 @@ class RigIntegrator(EdgeIntegrator):
             'type': 'rig',
             'max_depth': 3
     """
+
+    OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth", "lights_per_path")
 
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()
@@ -297,8 +300,7 @@ class RigIntegrator(EdgeIntegrator):
 
 def _whole(who: str, props: mi.Properties, key: str, default: int, least: int, most: int | None) -> int:
     value = props.get(key, default)
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    if not whole or value < least or (most is not None and value > most):
+    if not is_whole(value) or value < least or (most is not None and value > most):
         wanted = f">= {least}" if most is None else f"from {least} to {most}"
         raise ValueError(f'{who}: "{key}" must be a whole number {wanted}, got {value}')
     return value

@@ -1,0 +1,199 @@
+"""What derivatives lack is said: in the log, once, and in the plan."""
+
+from __future__ import annotations
+
+import cases
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from rimlight.edge_sampling import Geometry, Motion, derivative_image, find_edges, t_junctions
+
+FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
+
+
+def said(scene, *keys: str, kind: str = "direct_edge", times: int = 2, **options) -> list[str]:
+    """Warnings of a derivative with respect to some parameters, made several times by one integrator."""
+    params, integrator = mi.traverse(scene), mi.load_dict({"type": kind, **options})
+    for key in keys:
+        value = params[key]
+        dr.enable_grad(value)
+        params[key] = value
+    params.update()
+    with cases.messages() as messages:
+        for seed in range(times):
+            image = mi.render(scene, params, integrator=integrator, spp=1, seed=seed)
+            dr.backward(dr.sum(image, axis=None))
+    messages = [m for m in messages if f"{kind}: " in m]
+    limits = integrator.plan(scene).limits
+    assert [m.split(f"{kind}: ", 1)[1] for m in messages] == list(limits)
+    return messages
+
+
+# ---------------------- T-junctions ----------------------
+
+
+def strip(name: str, *points, **more):
+    """Triangles beside each other."""
+    return cases.mesh(name, points, [[k, k + 1, k + 2] for k in range(len(points) - 2)], **more)
+
+
+def halves(gap: float = 0.0, turn: float = 0.0, aligned: bool = False):
+    """A sheet with one long edge, and another with two short ones at the same place."""
+    grey = lambda value: {"bsdf": cases.diffuse(value, two_sided=True)}
+    left = cases.mesh("left", [[0, -1, 0], [0, 1, 0], [-1, 0, 0]], [[0, 1, 2]], **grey(0.8))
+    x, z = gap + np.cos(turn), np.sin(turn)
+    p = [[gap, -1, 0], [gap, 0, 0], [gap, 1, 0], [x, 0, z]]
+    right = cases.mesh(
+        "right", p[::2] + p[3:] if aligned else p, [[0, 2, 1]] if aligned else [[0, 3, 1], [1, 3, 2]], **grey(0.2)
+    )
+    return cases.scene(sensor=cases.camera((0, 0, -5)), left=left, right=right, sky=cases.constant())
+
+
+JUNCTION = 'T-junctions twice, where a vertex lies inside of an open edge: "left" and "right"'
+SHAPES = ("left.vertex_positions", "right.vertex_positions")
+
+
+@pytest.mark.parametrize("keys", [SHAPES, ("sensor.to_world",)], ids=["shapes", "camera"])
+def test_t_junctions_are_warned_about(keys):
+    (message,) = said(halves(), *keys)
+    assert JUNCTION in message
+
+
+@pytest.mark.parametrize(
+    ("scene", "keys"),
+    [
+        (lambda: halves(gap=1e-3), SHAPES),  # beside each other
+        (lambda: halves(aligned=True), SHAPES),  # welded
+        (halves, SHAPES[:1]),  # the other one stands still, and has no velocity
+        (halves, ("left.bsdf.brdf_0.reflectance.value",)),
+    ],
+    ids=["gap", "welded", "one moves", "colour"],
+)
+def test_no_t_junction_that_matters(scene, keys):
+    assert not said(scene(), *keys)
+
+
+def test_t_junctions_count_twice():
+    """Were it not so, the warning would be wrong."""
+    total = lambda scene: np.abs(
+        np.mean(
+            [
+                derivative_image(
+                    scene,
+                    mi.load_dict({"type": "direct_edge", "sppc": 0}),
+                    Motion(scene, "sensor.to_world", direction=[1, 0, 0]),
+                    spp=64,
+                    seed=seed,
+                )
+                for seed in range(4)
+            ],
+            axis=0,
+        )[12:20, 14:18]
+    ).sum()
+    assert total(halves()) == pytest.approx(2 * total(halves(aligned=True)), rel=0.05)
+
+
+def test_t_junctions_of_meshes():
+    """Turned about the common line; ends on it at an angle; within one mesh; and beyond its end."""
+    pairs = lambda *meshes: t_junctions(Geometry(tuple(meshes)), find_edges(Geometry(tuple(meshes))))
+    assert pairs(*[s for s in halves(turn=1.0).shapes() if s.is_mesh()]) == {(0, 1)}
+    long = strip("long", [0, 0, 0], [0, 2, 0], [-1, 1, 0])
+    assert pairs(long, strip("corner", [0, 1, 0], [1, 1, 0], [1, 2, 0])) == set()
+    assert pairs(long, strip("partly", [0, 1, 0], [0, 3, 0], [1, 2, 0])) == {(0, 1)}
+    assert pairs(long, strip("beyond", [0, 2.1, 0], [0, 3, 0], [1, 2, 0])) == set()
+    one = cases.mesh("one", [[0, 0, 0], [0, 2, 0], [-1, 1, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [0, 3, 4], [3, 1, 4]])
+    assert pairs(one) == {(0, 0)}
+    assert pairs(long) == set() and pairs() == set()
+
+
+def test_t_junctions_of_many_open_edges_are_found_in_seconds():
+    """A soup of 100,000 triangles: 300,000 open edges."""
+    rng = np.random.default_rng(0)
+    p = rng.uniform(-1, 1, (100_000, 1, 3)) + rng.uniform(-0.01, 0.01, (100_000, 3, 3))
+    geometry = Geometry((cases.mesh("soup", p.reshape(-1, 3), np.arange(300_000).reshape(-1, 3)),))
+    edges = find_edges(geometry)
+    assert len(edges) == 300_000 and t_junctions(geometry, edges) == set()
+
+
+# ---------------------- The far clipping plane ----------------------
+
+
+def to_the_horizon(far: float):
+    floor = cases.horizontal((0, -1, 0), 20, "floor", bsdf=cases.diffuse(0.5, two_sided=True))
+    thing = {"type": "sphere", "id": "thing", "radius": 0.5}
+    camera = cases.camera((0, 0, -5), (0, 0, 0), far_clip=far)
+    return cases.scene(sensor=camera, floor=floor, thing=thing, sky=cases.constant())
+
+
+@pytest.mark.parametrize("key", ["floor.vertex_positions", "sensor.to_world"])
+def test_cuts_of_the_far_plane_are_warned_about(key):
+    (message,) = said(to_the_horizon(15.0), key)
+    assert 'the far clipping plane of "sensor" through "floor"; increase its far_clip, now 15' in message
+
+
+@pytest.mark.parametrize(
+    ("far", "key"),
+    [(15.0, "thing.to_world"), (15.0, "floor.bsdf.brdf_0.reflectance.value"), (50.0, "sensor.to_world")],
+)
+def test_no_cut_of_the_far_plane_that_matters(far, key):
+    assert not said(to_the_horizon(far), key)
+
+
+def test_far_plane_of_each_sensor():
+    """The limits are those of the sensor that looks."""
+    scene = to_the_horizon(15.0)
+    other = mi.load_dict(cases.camera((0, 0, -5), (0, 0, 0), far_clip=50.0))
+    params, integrator = mi.traverse(scene), mi.load_dict({"type": "direct_edge"})
+    dr.enable_grad(params["floor.vertex_positions"])
+    params.update()
+    assert [len(integrator.plan(scene, sensor).limits) for sensor in (other, scene.sensors()[0], other)] == [0, 1, 0]
+
+
+# ---------------------- Signed distances ----------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"sppi": 0}], ids=str)
+def test_silhouettes_of_sdfgrid_are_warned_about(options):
+    x = np.linspace(-1, 1, 8)
+    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+    grid = mi.TensorXf((np.sqrt(x * x + y * y + z * z) - 0.8)[..., None].astype(np.float32))
+    scene = cases.cube(grid=lambda: {"type": "sdfgrid", "grid": grid})()
+    assert sum('silhouettes of "grid" (sdfgrid)' in m for m in said(scene, "cube.vertex_positions", **options)) == 1
+
+
+# ---------------------- Participating media ----------------------
+
+
+def foggy(where: str):
+    fog = {**FOG, "id": "fog"}
+    inside = {"interior": fog} if where == "shape" else {}
+    sensor = {**cases.camera(), **({"medium": fog} if where == "sensor" else {})}
+    cloud = {"type": "sphere", "bsdf": {"type": "null"}, **inside}
+    return cases.scene(sensor=sensor, cloud=cloud, cube=cases.smooth_cube(), sky=cases.constant())
+
+
+@pytest.mark.parametrize("kind", ["direct_edge", "prb_edge"])
+@pytest.mark.parametrize("where", ["shape", "sensor"])
+def test_media_are_warned_about(where, kind):
+    """Even if nothing moves."""
+    (message,) = said(foggy(where), "cube.bsdf.reflectance.value", kind=kind)
+    assert "(HomogeneousMedium) for empty" in message
+
+
+def test_scenes_without_media_say_nothing_of_them():
+    assert not said(foggy("nowhere"), "cube.bsdf.reflectance.value")
+
+
+@pytest.mark.parametrize("key", ["sigma_t.value.value", "albedo.value.value"])
+def test_gradients_of_media_are_refused(key):
+    scene = foggy("shape")
+    params = mi.traverse(scene)
+    (key,) = (k for k in params.properties if k.endswith(key))
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(
+        RuntimeError, match=r"(sigma_t|albedo)\S* .*carries a gradient, but participating media are not"
+    ):
+        mi.load_dict({"type": "direct_edge"}).render_forward(scene, params, spp=1)

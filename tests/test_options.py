@@ -1,0 +1,76 @@
+"""Properties of the plugins: none is unknown, unused or of the wrong kind without a word."""
+
+from __future__ import annotations
+
+import cases
+import mitsuba as mi
+import pytest
+
+INTEGRATORS = ("direct_edge", "prb_edge", "rig")
+
+
+@pytest.mark.parametrize("kind", INTEGRATORS)
+@pytest.mark.parametrize(
+    ("key", "near"), [("sppii", "sppi"), ("hide_emitter", "hide_emitters"), ("spp_p", "sppp")], ids=lambda text: text
+)
+def test_misspelt_properties_of_integrators_are_refused(kind, key, near):
+    with pytest.raises(RuntimeError, match=f'{kind}: unknown property "{key}", did you mean "{near}"'):
+        mi.load_dict({"type": kind, key: 1})
+
+
+@pytest.mark.parametrize("kind", ["prb_edge", "rig"])
+def test_misspelt_depths_are_refused(kind):
+    with pytest.raises(RuntimeError, match='unknown property "maxdepth", did you mean "max_depth"'):
+        mi.load_dict({"type": kind, "maxdepth": 3})
+
+
+@pytest.mark.parametrize("kind", INTEGRATORS)
+@pytest.mark.parametrize("key", ["block_size", "samples_per_pass", "timeout"])
+def test_properties_that_only_bases_read_are_refused(kind, key):
+    """Mitsuba's base classes read these, but renderings by these integrators do not heed them."""
+    with pytest.raises(RuntimeError, match=f'{kind}: unknown property "{key}", known are sppc'):
+        mi.load_dict({"type": kind, key: 8})
+
+
+@pytest.mark.parametrize("key", ["max_depth", "rr_depth"])
+def test_direct_edge_has_no_depth(key):
+    with pytest.raises(RuntimeError, match=f'direct_edge: there is no property "{key}".*prb_edge'):
+        mi.load_dict({"type": "direct_edge", key: 2})
+    with pytest.raises(RuntimeError, match=f'direct_edge: there is no property "{key}".*prb_edge'):
+        options = f'<integer name="{key}" value="2"/>'
+        mi.load_string(f'<scene version="3.0.0"><integrator type="direct_edge">{options}</integrator></scene>')
+
+
+@pytest.mark.parametrize("kind", INTEGRATORS)
+@pytest.mark.parametrize("key", ["sppc", "sppp", "sppi"])
+@pytest.mark.parametrize("value", [True, False, 1.0])
+def test_sample_counts_are_whole_numbers(kind, key, value):
+    with pytest.raises(RuntimeError, match=f'{kind}: "{key}" must be a whole number >= 0, got {value}'):
+        mi.load_dict({"type": kind, key: value})
+
+
+@pytest.mark.parametrize("kind", INTEGRATORS)
+def test_options_of_the_projective_integrators_have_no_effect(kind):
+    """So that one word is enough to switch. `prb_projective` must accept them, too."""
+    options = {"guiding": "grid", "guiding_proj": False, "guiding_rounds": 2, "project_seed": "bsdf", "sppi": 8}
+    mi.load_dict({"type": "prb_projective", **options})
+    with cases.messages() as messages:
+        mi.load_dict({"type": kind, **options})
+    (line,) = messages
+    assert kind in line and "have no effect" in line and all(f'"{key}"' in line for key in options if key != "sppi")
+
+
+@pytest.mark.parametrize(
+    "plugin",
+    [
+        {"type": "blinn_phong"},
+        {"type": "ggx_dictionary", "material": "gold-paint"},
+        {"type": "distant_lights", "directions": "0 0 1"},
+        {"type": "led"},
+        {"type": "fisheye"},
+    ],
+    ids=lambda plugin: plugin["type"],
+)
+def test_unknown_properties_of_other_plugins_are_refused(plugin):
+    with pytest.raises(RuntimeError, match="no_such_property"):
+        mi.load_dict({**plugin, "no_such_property": 1})
