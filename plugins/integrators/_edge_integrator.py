@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -126,11 +125,11 @@ class EdgeIntegrator(ADIntegrator):
     #: Names of the properties. Subclasses that have more extend them.
     OPTIONS: tuple[str, ...] = ("sppc", "sppp", "sppi", "hide_emitters")
 
-    #: Properties that similar plugins have, but this one does not: what to do instead.
-    WITHOUT: ClassVar[dict[str, str]] = {}
+    #: Properties that are accepted, but have no effect.
+    IDLE: tuple[str, ...] = ()
 
     def __init__(self, props: mi.Properties, max_depth: int = 2, rr_depth: int = 5):
-        check_options(props, self.OPTIONS, self.WITHOUT)
+        check_options(props, self.OPTIONS, self.IDLE)
         super().__init__(props)
         self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
         self.name = props.plugin_name()

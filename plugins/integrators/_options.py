@@ -11,32 +11,30 @@ import mitsuba as mi
 PROJECTIVE = ("guiding", "guiding_proj", "guiding_rounds", "project_seed")
 
 
-def check_options(props: mi.Properties, known: tuple[str, ...], without: dict[str, str]) -> None:
-    """Refuse properties that a plugin does not have. Mitsuba itself refuses only those that no base class reads.
+def check_options(props: mi.Properties, known: tuple[str, ...], idle: tuple[str, ...] = ()) -> None:
+    """Refuse properties that a plugin does not have. Mitsuba itself refuses only those that no base class reads. Those
+    that Mitsuba's projective integrators have, but this plugin has no use for, are accepted, with one line in the log.
 
     known : the names of its properties.
-    without : properties of similar plugins that this one does not have, each with a remedy.
+    idle : properties that have no effect, besides `PROJECTIVE`.
 
     Raises
     ------
     ValueError : there is another one.
     """
-    who, idle = props.plugin_name(), []
+    who, found = props.plugin_name(), []
     for key in props.keys():  # noqa: SIM118 (not a dictionary)
         if key in known:
             continue
-        if key in PROJECTIVE:
-            props.mark_queried(key)
-            idle.append(f'"{key}"')
-            continue
-        if key in without:
-            raise ValueError(f'{who}: there is no property "{key}". {without[key]}')
-        near = get_close_matches(key, known, n=1)
-        remedy = f'did you mean "{near[0]}"?' if near else f"known are {', '.join(known)}."
-        raise ValueError(f'{who}: unknown property "{key}", {remedy}')
-    if idle:
-        have = "has" if len(idle) == 1 else "have"
-        mi.Log(mi.LogLevel.Warn, f"{who}: {', '.join(idle)} {have} no effect, since edge sampling needs no guiding.")
+        if key not in (*PROJECTIVE, *idle):
+            near = get_close_matches(key, known, n=1)
+            remedy = f'did you mean "{near[0]}"?' if near else f"known are {', '.join(known)}."
+            raise ValueError(f'{who}: unknown property "{key}", {remedy}')
+        props.mark_queried(key)
+        found.append(f'"{key}"')
+    if found:
+        have = "has" if len(found) == 1 else "have"
+        mi.Log(mi.LogLevel.Warn, f"{who}: {', '.join(found)} {have} no effect on it.")
 
 
 def is_whole(value: object) -> bool:

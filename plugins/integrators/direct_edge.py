@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import mitsuba as mi
 
 from ._edge_integrator import EdgeIntegrator
@@ -68,9 +66,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
             'sppi': 0
     """
 
-    WITHOUT: ClassVar[dict[str, str]] = dict.fromkeys(
-        ("max_depth", "rr_depth"), "Its paths end after direct illumination: leave the property out, or use prb_edge."
-    )
+    #: Its paths end after direct illumination. `direct_projective` has these properties, and does not heed them either.
+    IDLE = ("max_depth", "rr_depth")
 
     def __init__(self, props: mi.Properties):
         super().__init__(props, max_depth=2)
