@@ -226,7 +226,8 @@ class Scattering:
         d = y.p - si.p
         r2 = dr.squared_norm(d)
         ω = d * dr.rsqrt(r2)
-        y.wi = dr.replace_grad(y.wi, y.to_local(-ω))
+        # A ray that meets nothing keeps its direction.
+        y.wi = dr.select(active, dr.replace_grad(y.wi, y.to_local(-ω)), y.wi)
         geometry = dr.abs_dot(y.n, ω) / r2
         if self.moving:
             geometry *= self._area(pi, ray, active)
