@@ -41,6 +41,10 @@ STAGES = ((10, 6), (24, 24), (80, 96))
 #: The derivative is right if its projection on the reference is 1 within this, and `ERRORS` standard errors.
 TOLERANCE, ERRORS = 0.015, 4.0
 
+#: Sums over squares of so many pixels must agree within `TOLERANCE` of what the reference has there, and so many standard
+#: errors. (There are 16 of them, and their errors come from few runs.)
+SQUARE, LARGEST = 5, 5.5
+
 #: A projection whose standard error is above this tells nothing: more samples are taken.
 TELLING = 0.03
 
@@ -534,6 +538,7 @@ class Comparison:
     scale, error : projection ⟨g, ref⟩ / ⟨ref, ref⟩ over the pixels where the reference is not noise, and its standard
         error.
     relative, noise : Σ|g − ref| / Σ|ref|, and what of it noise explains.
+    largest : difference of the sums over a square of pixels, in standard errors, beyond what is tolerated; the largest.
     size : Σ|ref|.
     finite : is every number of the derivative?
     """
@@ -544,6 +549,7 @@ class Comparison:
     error: float = math.nan
     relative: float = math.nan
     noise: float = math.nan
+    largest: float = math.nan
     size: float = 0.0
     finite: bool = True
     seconds: float = 0.0
@@ -557,11 +563,12 @@ class Comparison:
         if self.size == 0:
             return self.relative == 0  # nothing is seen to change
         # Not all of a difference need lie along the reference: what noise does not explain must be small as well.
-        return abs(self.scale - 1) <= TOLERANCE + ERRORS * self.error and self.relative <= 0.04 + 1.3 * self.noise
+        whole = abs(self.scale - 1) <= TOLERANCE + ERRORS * self.error and self.relative <= 0.04 + 1.3 * self.noise
+        return whole and self.largest <= LARGEST
 
     def __str__(self) -> str:
         verdict = "ERR" if self.raised else "ok " if self.agrees else "BAD" if self.finite else "NAN"
-        numbers = f"scale {self.scale:.3f}+-{self.error:.3f} L1 {self.relative:.3f} noise {self.noise:.3f}"
+        numbers = f"scale {self.scale:.3f}+-{self.error:.3f} L1 {self.relative:.3f} noise {self.noise:.3f} z {self.largest:4.1f}"
         numbers += f" |ref| {self.size:9.3g} {self.seconds:5.1f} s  "
         return f"{self.seed:6d} {verdict} {self.stage} " + (self.raised if self.raised else numbers) + " " + self.label
 
@@ -590,6 +597,19 @@ def statistics(reference: np.ndarray, derivative: np.ndarray, row: Comparison) -
     row.error = math.sqrt(float(variance)) / theirs
     row.relative = float(np.abs(g - ref).sum()) / row.size
     row.noise = math.sqrt(2 / math.pi) * float(np.hypot(g_error, ref_error).sum()) / row.size
+    squares, totals = _squares(reference), _squares(np.abs(ref)[None])[0]
+    difference = _squares(derivative)
+    error = np.sqrt(squares.var(0, ddof=1) / len(squares) + difference.var(0, ddof=1) / len(difference))
+    beyond = np.abs(difference.mean(0) - squares.mean(0)) - TOLERANCE * totals
+    row.largest = float((beyond / (error + 1e-4 * totals.max())).max())
+
+
+def _squares(images: np.ndarray) -> np.ndarray:
+    """Sums over squares of pixels, and over the channels: (R, H', W')."""
+    sums = images.sum(3)
+    for axis in (1, 2):
+        sums = np.add.reduceat(sums, np.arange(0, sums.shape[axis], SQUARE), axis=axis)
+    return sums
 
 
 def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES) -> Comparison:

@@ -123,7 +123,10 @@ class Scattering:
             # Lights at infinity: the direction is fixed.
             attached = y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf)
             if self.any_elsewhere:
-                elsewhere = scene.eval_emitter_direction(si, ds, active & ~on_surface & ~ds.delta) / ds.pdf
+                # By `eval`: the `eval_direction` of `envmap` does not notice that the environment turns (Mitsuba 3.9).
+                seen = dr.zeros(mi.SurfaceInteraction3f, dr.width(ds.d))
+                seen.wi, seen.wavelengths, seen.time = -ds.d, si.wavelengths, si.time
+                elsewhere = ds.emitter.eval(seen, active & ~on_surface & ~ds.delta) / ds.pdf
                 attached = dr.select(on_surface, attached, elsewhere)
             if self.any_delta or self.several:
                 # A point of a disc follows it.
