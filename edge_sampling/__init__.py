@@ -6,6 +6,7 @@ from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
+from .horizon import Horizon, Horizons
 from .intersections import intersecting_meshes, t_junctions
 from .lights import Lights, has_hard_beam
 from .meshes import Geometry, jumping_textures, objects_below
@@ -29,6 +30,8 @@ __all__ = [
     "FilmPart",
     "FiniteDifferences",
     "Geometry",
+    "Horizon",
+    "Horizons",
     "Lights",
     "Lobe",
     "Motion",

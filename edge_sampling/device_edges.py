@@ -77,10 +77,7 @@ class DeviceEdges:
         passed = [mi.Bool(False), mi.Bool(False)]
         for o in opposite:
             for k, ray in enumerate(rays):
-                corners = [c - ray.o for c in (a, b, o)]
-                turns = [dr.dot(ray.d, dr.cross(corners[i], corners[i - 1])) for i in range(3)]
-                passed[k] |= (dr.minimum(*turns[:2]) > 0) & (turns[2] > 0)
-                passed[k] |= (dr.maximum(*turns[:2]) < 0) & (turns[2] < 0)
+                passed[k] |= passes(ray, [a, b, o])
         return fold & ~(passed[0] & passed[1])
 
     def is_silhouette_of_any(self, positions: mi.Float, edge: mi.UInt32, places: mi.Vector4f) -> mi.Bool:
@@ -139,6 +136,14 @@ class DeviceEdges:
         if geometry is not None and EdgeKind.SPLIT in self._kinds:
             boundary |= (kind == int(EdgeKind.SPLIT)) & (self.normals_differ(geometry.normals(), edge) > COPLANAR)
         return boundary
+
+
+def passes(ray: mi.Ray3f, corners: list[mi.Point3f]) -> mi.Bool:
+    """Does the line of a ray pass through a triangle?"""
+    corners = [c - ray.o for c in corners]
+    turns = [dr.dot(ray.d, dr.cross(corners[i], corners[i - 1])) for i in range(3)]
+    front = (dr.minimum(*turns[:2]) > 0) & (turns[2] > 0)
+    return front | ((dr.maximum(*turns[:2]) < 0) & (turns[2] < 0))
 
 
 def beside_edge(p: mi.Point3f, q: mi.Point3f) -> mi.Float:

@@ -7,8 +7,8 @@ For a pixel with filter k, I = ∫ k(u) L(u) du. Where an edge moves with the ve
 (Li et al. 2018, Eq. 7, with the edge function's gradient written as a velocity). With the edge as a curve u(t), the
 length element and the normal join to n dl = (−u'ᵧ, u'ₓ) dt, so that neither is ever normalised.
 
-Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces, and
-at the outlines of spheres, disks and cylinders.
+Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces,
+where interpolated normals turn away from the viewer (`horizon.py`), and at the outlines of spheres, disks, cylinders.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 from .curves import Curves
 from .device_edges import DeviceEdges
 from .edges import Edges
+from .horizon import Horizon, HorizonPoint, Horizons
 from .lights import Lights
 from .meshes import Geometry
 from .projection import Projection, inside_frame
@@ -58,7 +59,7 @@ class BoundaryPoints:
     rays     : that look beside the edge, on its − and on its + side.
     weights  : of these rays.
     active   : mi.Bool, (N,)
-    outline  : mi.Bool, (N,), does the ray pass a silhouette, or something else that is one from everywhere?
+    horizons : on which side of a horizon of interpolated normals each of the rays is.
     sensor_moves : does the velocity depend on parameters of the sensor?
     """
 
@@ -68,7 +69,7 @@ class BoundaryPoints:
     rays: list[mi.RayDifferential3f]
     weights: list[mi.Spectrum]
     active: mi.Bool
-    outline: mi.Bool
+    horizons: list[Horizon]
     sensor_moves: bool
 
 
@@ -83,7 +84,7 @@ class FilmBoundary:
     lights : of the scene.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "curves", "counts", "lights"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "horizons", "curves", "counts", "lights"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights):
         self.geometry, self.lights = geometry, lights
@@ -94,8 +95,11 @@ class FilmBoundary:
         shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
         shapes = tuple(s for s, moves in shapes if moves)
         self.curves = Curves(shapes) if shapes else None
-        #: How many edges, then cuts through faces, then pieces of curves there are.
-        self.counts = (len(edges), len(faces) if len(edges) else 0, len(self.curves) if shapes else 0)
+        horizons = Horizons(geometry, moving[: len(geometry.meshes)])
+        self.horizons = horizons if len(horizons) else None
+        #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
+        cuts = len(faces) if len(edges) else 0
+        self.counts = (len(edges), cuts, len(horizons), len(self.curves) if shapes else 0)
 
     def sample(
         self,
@@ -103,7 +107,7 @@ class FilmBoundary:
         sensor: mi.Sensor,
         sampler: mi.Sampler,
         count: int,
-        radiance: Callable[[mi.RayDifferential3f, mi.Sampler, mi.Bool, mi.Bool], tuple[mi.Spectrum, mi.Float]],
+        radiance: Callable[[mi.RayDifferential3f, mi.Sampler, mi.Bool, Horizon], tuple[mi.Spectrum, mi.Float]],
     ) -> BoundarySamples:
         """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
 
@@ -111,10 +115,9 @@ class FilmBoundary:
         stratified number. Where edges are curves on the film, angles from the eye stand for lengths.
 
         sampler : seeded for `count` lanes.
-        radiance : maps (rays, sampler, active, outline) to (L, alpha), detached; `outline`: does the ray pass a
-            silhouette, or something else that is one from everywhere? Called for both sides of the edge with equal
-            random numbers, so that an edge that is hidden, or across which nothing jumps, contributes next to nothing
-            rather than noise.
+        radiance : maps (rays, sampler, active, horizon) to (L, alpha), detached. Called for both sides of the edge
+            with equal random numbers, so that an edge that is hidden, or across which nothing jumps, contributes next
+            to nothing rather than noise.
 
         Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by
         it, and folds of faces that are narrower on the film do not count.
@@ -122,8 +125,9 @@ class FilmBoundary:
         with dr.suspend_grad():
             points = self.points(scene, sensor, sampler, count)
             jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
-            for sign, ray, weight in zip((-1, 1), points.rays, points.weights, strict=True):
-                L, alpha = radiance(ray, sampler.clone(), points.active, points.outline)
+            sides = zip((-1, 1), points.rays, points.weights, points.horizons, strict=True)
+            for sign, ray, weight, horizon in sides:
+                L, alpha = radiance(ray, sampler.clone(), points.active, horizon)
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
             if points.sensor_moves:
@@ -140,15 +144,17 @@ class FilmBoundary:
             projection = Projection(sensor)
             positions = self.geometry.positions()
             frames = self.curves.frames() if self.curves is not None else None
+            normals = self.geometry.normals() if self.horizons is not None else None
         with dr.suspend_grad():
             aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
             # Where interpolated normals go on being lit, the shadow of a mesh on itself begins at edges that are
             # silhouettes as seen from a light: that is a jump, too, if the light has no size.
             smooth = self.edges is not None and self.edges.any_smooth
             lights = self.lights.places(scene) if smooth else None
-            lengths = self._visible_lengths(projection, positions, frames, lights)
+            lengths = self._visible_lengths(projection, positions, normals, frames, lights)
             index, along, density = self._choose(lengths, sampler, count)
             is_edge, is_line = index < self.counts[0], index < sum(self.counts[:2])
+            is_curve = index >= sum(self.counts[:3])
             along_film, valid = mi.Vector2f(0), mi.Bool(False)
             if self.edges is not None:
                 a, b = self._end_points(projection, positions, index)
@@ -157,11 +163,20 @@ class FilmBoundary:
                 along_film, valid = projection.tangent(a, b, t, aperture_sample) * dt, is_line & (visible.length > 0)
             if self.curves is not None:
                 eye = -projection.view() if projection.orthographic else projection.eye(aperture_sample)
-                piece = dr.select(is_line, 0, index - sum(self.counts[:2]))
+                piece = dr.select(is_curve, index - sum(self.counts[:3]), 0)
                 c = self.curves.point(frames, piece, along, eye, projection.orthographic)
                 on_film = projection.tangent(c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), aperture_sample)
-                along_film = dr.select(is_line, along_film, on_film)
-                valid |= ~is_line & c.valid & (projection.film(c.p).z > projection.near)
+                along_film = dr.select(is_curve, on_film, along_film)
+                valid |= is_curve & c.valid & (projection.film(c.p).z > projection.near)
+            facing = mi.Vector2f(0)
+            if self.horizons is not None:
+                is_horizon = ~is_line & ~is_curve
+                face = dr.select(is_horizon, index - sum(self.counts[:2]), 0)
+                h = self._horizon_point(projection, positions, normals, face, along, aperture_sample)
+                across = lambda v: projection.tangent(h.p, mi.Point3f(h.p + v), mi.Float(0), aperture_sample)
+                along_film = dr.select(is_horizon, across(h.tangent), along_film)
+                facing = across(h.facing)
+                valid |= is_horizon & h.valid & (projection.film(h.p).z > projection.near)
             valid &= (density > 0) & dr.isfinite(dr.squared_norm(along_film))
 
         # Only here does the gradient enter: the velocity of a point that is fixed on the edge.
@@ -171,7 +186,10 @@ class FilmBoundary:
                 p = dr.lerp(*self._end_points(projection, positions, index), t)
             if self.curves is not None:
                 c = self.curves.point(frames, piece, along, eye, projection.orthographic)
-                p = dr.select(is_line, p, c.p)
+                p = dr.select(is_curve, c.p, p)
+            if self.horizons is not None:
+                h = self._horizon_point(projection, positions, normals, face, along, aperture_sample)
+                p = dr.select(is_horizon, h.p, p)
             # What is not visible has no place on the film: any point in front of the sensor stands for it, for even
             # with the value zero, a sample at a position that is not finite would spoil a pixel.
             p = dr.select(valid, p, mi.Point3f(projection.eye() + projection.view()))
@@ -180,6 +198,9 @@ class FilmBoundary:
 
         with dr.suspend_grad():
             n_dl = mi.Vector2f(-along_film.y, along_film.x) / density
+            if self.horizons is not None:
+                # From where normals face away to where they do not.
+                n_dl = dr.select(is_horizon, dr.mulsign(n_dl, dr.dot(n_dl, facing)), n_dl)
             n = dr.normalize(n_dl)
             u, p = dr.detach(u), dr.detach(p)
             offset = self._offset(projection, p) * n
@@ -201,17 +222,25 @@ class FilmBoundary:
                 weights.append(weight)
             if self.edges is not None:
                 active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, index, 0), p, rays))
+            if self.horizons is not None:
+                # Beside a silhouette that is closer than the rays look, the silhouette has this jump already.
+                active &= ~is_horizon | self.horizons.passed(positions, face, rays[0])
             if self.curves is not None:
                 # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
                 # that: a jump of the contour's, which would count twice.
                 wall = projection.tangent(c.p, mi.Point3f(c.p + c.inwards), mi.Float(0), aperture_sample)
                 missed = [self.curves.misses(frames, piece, ray) for ray in rays]
-                active &= is_line | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
-            outline = dr.full(mi.Bool, True, count)
-            if lights is not None:
-                outline = ~is_edge | self._jumps(projection, positions, dr.select(is_edge, index, 0))
+                active &= ~is_curve | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
+            side = dr.zeros(mi.Float, count)
+            if self.horizons is not None:
+                side = dr.select(is_horizon, mi.Float(1), 0)
+            horizons = [Horizon(sign * side, p) for sign in (-1, 1)]
             n_dl = dr.select(active, n_dl, 0)
-            return BoundaryPoints(u, n_dl, velocity, rays, weights, active, outline, projection.attached)
+            return BoundaryPoints(u, n_dl, velocity, rays, weights, active, horizons, projection.attached)
+
+    def _horizon_point(self, projection: Projection, positions, normals, face, s, aperture_sample) -> HorizonPoint:
+        eye, far = projection.viewer(aperture_sample), projection.orthographic
+        return self.horizons.point(positions, normals, face, s, eye, far)
 
     def _choose(self, lengths: mi.Float, sampler: mi.Sampler, count: int) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Choose edges in proportion to their length on the film.
@@ -249,11 +278,12 @@ class FilmBoundary:
         self,
         projection: Projection,
         positions: mi.Float,
+        normals: mi.Float | None,
         frames: mi.Float | None,
         lights: mi.Vector4f | None,
     ) -> mi.Float:
-        """Length inside the frame of each edge, cut and piece of a curve, 0 where nothing can jump: pixels on the film;
-        of curves, an estimate."""
+        """Length inside the frame of each edge, cut, horizon and piece of a curve, 0 where nothing can jump: pixels on
+        the film; of horizons and curves, an estimate."""
         lengths = []
         if self.edges is not None:
             edge, face = (dr.arange(mi.UInt32, n) for n in self.counts[:2])
@@ -263,13 +293,19 @@ class FilmBoundary:
             for a, b in (self.edges.end_points(positions, edge), self._cut(projection, positions, face)):
                 lengths.append(projection.clip(a, b).length)
             lengths[0] = dr.select(jumps, lengths[0], 0)
+        if self.horizons is not None:
+            face = dr.arange(mi.UInt32, self.counts[2])
+            eye, far, radius = projection.viewer(), projection.orthographic, projection.lens_radius()
+            a, b, possible = self.horizons.chords(positions, normals, face, eye, far, radius)
+            length = projection.clip(a, b).length
+            lengths.append(dr.select(possible, length, 0))
         if self.curves is not None:
             lengths.append(self._curve_length(projection, frames))
         return dr.concat(lengths) if len(lengths) > 1 else lengths[0]
 
     def _curve_length(self, projection: Projection, frames: mi.Float) -> mi.Float:
         """About the length of each piece of a curve, 0 only where it is certainly out of the frame."""
-        piece = dr.arange(mi.UInt32, self.counts[2])
+        piece = dr.arange(mi.UInt32, self.counts[3])
         eye = -projection.view() if projection.orthographic else projection.eye()
         lower, upper = projection.frame
         points = [
@@ -294,7 +330,7 @@ class FilmBoundary:
         self, projection: Projection, positions: mi.Float, index: mi.UInt32
     ) -> tuple[mi.Point3f, mi.Point3f]:
         """End points of edges, or beyond their number of cuts: world space."""
-        edges, faces, _ = self.counts
+        edges, faces = self.counts[:2]
         is_edge, is_face = index < edges, (index >= edges) & (index < edges + faces)
         edge = self.edges.end_points(positions, dr.select(is_edge, index, 0))
         cut = self._cut(projection, positions, dr.select(is_face, index - edges, 0))

@@ -70,12 +70,10 @@ class Geometry:
         return np.concatenate([vertices(m) for m in self.meshes]) if self.meshes else np.zeros((0, 3), np.float32)
 
     def normals(self) -> mi.Float:
-        """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Detached."""
+        """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Attached."""
         return _concat(
             [
-                dr.detach(m.vertex_normals_buffer())
-                if has_interpolated_normals(m)
-                else dr.zeros(mi.Float, 3 * m.vertex_count())
+                m.vertex_normals_buffer() if has_interpolated_normals(m) else dr.zeros(mi.Float, 3 * m.vertex_count())
                 for m in self.meshes
             ]
         )

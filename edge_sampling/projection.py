@@ -69,6 +69,7 @@ class Projection(ABC):
     """
 
     orthographic = False
+    aperture_radius: mi.Float | None = None
 
     def __new__(cls, sensor: mi.Sensor):
         kind = _kind(sensor)
@@ -115,6 +116,16 @@ class Projection(ABC):
         if aperture_sample is not None:
             lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample) * self.lens_radius()
         return dr.detach(self.to_world) @ mi.Point3f(lens.x, lens.y, 0)
+
+    def viewer(self, aperture_sample: mi.Point2f | None = None) -> mi.Point3f:
+        """Point of the lens as `eye` has it, or where rays are parallel the direction towards the viewer: world space;
+        attached, if gradients are not suspended."""
+        if self.orthographic:
+            return mi.Point3f(dr.normalize(self.to_world @ mi.Vector3f(0, 0, -1)))
+        lens = mi.Point2f(0)
+        if aperture_sample is not None and self.aperture_radius is not None:
+            lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample) * self.aperture_radius
+        return self.to_world @ mi.Point3f(lens.x, lens.y, 0)
 
     def view(self) -> mi.Vector3f:
         """Optical axis, world space, unit length. Detached."""

@@ -568,8 +568,8 @@ class Comparison:
 
     def __str__(self) -> str:
         verdict = "ERR" if self.raised else "ok " if self.agrees else "BAD" if self.finite else "NAN"
-        numbers = f"scale {self.scale:.3f}+-{self.error:.3f} L1 {self.relative:.3f} noise {self.noise:.3f} z {self.largest:4.1f}"
-        numbers += f" |ref| {self.size:9.3g} {self.seconds:5.1f} s  "
+        numbers = f"scale {self.scale:.3f}+-{self.error:.3f} L1 {self.relative:.3f} noise {self.noise:.3f}"
+        numbers += f" z {self.largest:4.1f} |ref| {self.size:9.3g} {self.seconds:5.1f} s  "
         return f"{self.seed:6d} {verdict} {self.stage} " + (self.raised if self.raised else numbers) + " " + self.label
 
 

@@ -38,7 +38,7 @@ from ._finite import report_gradients, report_image, values_of
 from ._limits import Media, PartialParameters, beyond_far_plane, is_mirror, lets_through
 from ._options import check_options, is_whole
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
-from ._scattering import Scattering, met_by, up_to_horizon
+from ._scattering import Scattering, met_by, turn_to_side
 
 HARD_SHADOWS = (
     "the derivative has the hard shadows of lights without size (point, spot, directional, ...) on what the camera "
@@ -224,11 +224,10 @@ class EdgeIntegrator(ADIntegrator):
 
     # ---------------------- Radiance ----------------------
 
-    def sample(self, mode, scene, sampler, ray, active=True, beyond_horizon=False, **_):
+    def sample(self, mode, scene, sampler, ray, active=True, horizon=None, **_):
         """Estimate the radiance along camera rays. Call it with gradients suspended: it resumes them where they belong.
 
-        beyond_horizon : where to turn shading normals that face away from a visible face back to its horizon, see
-            `up_to_horizon`.
+        horizon : `Horizon`, on which side of the horizon of interpolated normals the first hit is; None: as it is.
 
         Returns
         -------
@@ -246,8 +245,8 @@ class EdgeIntegrator(ADIntegrator):
         # A surface that moves is met by a fixed ray; a ray that moves with the camera takes its hit along.
         pi = self._first_hit(scene, ray, active)
         si = met_by(ray, pi, mi.RayFlags.All, active, attached)
-        if beyond_horizon is not False:
-            up_to_horizon(si, ray, beyond_horizon)
+        if horizon is not None:
+            turn_to_side(si, ray, horizon)
         with dr.resume_grad(when=attached):
             if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
@@ -292,9 +291,9 @@ class EdgeIntegrator(ADIntegrator):
             pi[skip] = self.skip_area_emitters(scene, onwards, True, skip)
         return pi
 
-    def _beside_edge(self, scene, ray, sampler, active, outline) -> tuple[mi.Spectrum, mi.Float]:
+    def _beside_edge(self, scene, ray, sampler, active, horizon) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha beside an edge on the film."""
-        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, beyond_horizon=outline)
+        L, valid, _, _ = self.sample(dr.ADMode.Primal, scene, sampler, ray, active=active, horizon=horizon)
         return L, dr.select(valid, mi.Float(1), 0)
 
     def _seen_from_vertex(self, scene, sampler, choice, ray, shading: ShadingBoundary) -> mi.Spectrum:
@@ -454,7 +453,7 @@ class EdgeIntegrator(ADIntegrator):
             sum(self._line_samples(part.sensor, sppp) for part in film_parts(sensor)),
             2 * path,
             film is not None and sppp,
-            f"{film.counts[0] + film.counts[2] if film else 0} edges may move on the film",
+            f"{film.counts[0] + film.counts[3] if film else 0} edges may move on the film",
             '"sppp" is 0' if film is not None else "only lights move" if moves else "nothing moves",
         )
         add(

@@ -14,12 +14,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling import Lights
+from rimlight.edge_sampling import Horizon, Lights
 
 from ._cut_rays import CutRays
 from ._layers import Layers
 from ._paths import Depths, Vertex, step
-from ._scattering import Scattering, met_by, up_to_horizon
+from ._scattering import Scattering, met_by, turn_to_side
 
 #: Light samples of one vertex differ by these, modulo 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom
 #: sequences", R2). By itself, each is uniform.
@@ -86,7 +86,7 @@ class Place:
     u : mi.Point2f, position on the film, pixels.
     sample : mi.Point2f, random numbers for lights with an extent, or None.
     choice : mi.Float, which lights are evaluated; None for all.
-    outline : mi.Bool, do normals of the first vertex turn back to the horizon? None: nowhere.
+    horizon : on which side of the horizon of interpolated normals the first vertex is; None: as it is.
     """
 
     number: int
@@ -98,7 +98,7 @@ class Place:
     u: mi.Point2f
     sample: mi.Point2f | None
     choice: mi.Float | None
-    outline: mi.Bool | None
+    horizon: Horizon | None
 
     @property
     def β(self) -> mi.Spectrum:
@@ -117,8 +117,8 @@ class Place:
                 flags = mi.RayFlags.Minimal | follow(self.number - 1)
                 x = pi.compute_surface_interaction(ray, flags, active).p
                 si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
-        if self.outline is not None and self.number == 1:
-            up_to_horizon(si, self.ray, self.outline)
+        if self.horizon is not None and self.number == 1:
+            turn_to_side(si, self.ray, self.horizon)
         return si
 
     def in_front(self, active: mi.Bool) -> tuple[Place, mi.Bool, mi.UInt32]:
@@ -141,7 +141,7 @@ class Place:
             before = None if self.before is None else tuple(at(v) for v in self.before)
             moved = {
                 k: at(getattr(self, k))
-                for k in ("ray", "pi", "throughput", "scale", "u", "sample", "choice", "outline")
+                for k in ("ray", "pi", "throughput", "scale", "u", "sample", "choice", "horizon")
             }
         return replace(self, before=before, **moved), there, index
 
@@ -359,7 +359,7 @@ class LightPaths:
         scale: mi.Spectrum,
         choice: mi.Float | None = None,
         active: mi.Bool | bool = True,
-        outline: mi.Bool | None = None,
+        horizon: Horizon | None = None,
     ) -> None:
         """Trace paths, and hand the light at their vertices over. Call it with gradients suspended.
 
@@ -368,7 +368,7 @@ class LightPaths:
         u : their positions on the film, pixels.
         scale : mi.Spectrum, (N,), what their radiance is multiplied by. Detached.
         choice : mi.Float, (N,), uniform; which lights are evaluated. None if all of them are.
-        outline : mi.Bool, (N,), where to turn normals back to the horizon, see `up_to_horizon`. None: nowhere.
+        horizon : on which side of the horizon of interpolated normals the first vertices are; None: as they are.
         """
         scattering = LightByLight(self.scene, self.lights, self.per_path, attached=to.attached)
         area = scattering.any_hit_by_rays
@@ -378,7 +378,7 @@ class LightPaths:
         ray = to.start(ray)
         pi = self.first_hit(self.scene, ray, active)
         one, zero = (dr.full(mi.Spectrum, value, dr.width(u)) for value in (1, 0))
-        place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, outline)
+        place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, horizon)
         if area and not self.hide_emitters:
             self._seen(to, scattering, place, active)
         active &= pi.is_valid()

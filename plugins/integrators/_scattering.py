@@ -8,6 +8,9 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import mis_weight
 
+from rimlight.edge_sampling import Horizon
+from rimlight.edge_sampling.device_edges import rounding
+
 from ._limits import divides_by_density
 
 
@@ -302,18 +305,20 @@ def met_by(
         return si
 
 
-def up_to_horizon(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool | bool) -> None:
-    """Turn interpolated normals that face away from the viewer, on a face that does not, until they just face them.
+def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -> None:
+    """Turn interpolated normals that lie on the horizon of the viewer, but for rounding, to a side of it.
 
-    Just inside of the silhouette of a smooth-shaded mesh such normals make a black fringe, whose inner border is a
-    jump that lies on no edge. The finer the mesh, the narrower the fringe: its two borders are taken together, as one
-    jump from the background to the surface beside it.
+    Does nothing to what hides the point of the horizon.
     """
     to_viewer = -ray.d
-    side = dr.sign(dr.dot(si.n, to_viewer))
-    cos = side * dr.dot(si.sh_frame.n, to_viewer)
-    ε = 1e-4
-    away = active & si.is_valid() & (cos < ε)
-    si.sh_frame.n = dr.select(away, dr.normalize(si.sh_frame.n + side * (ε - cos) * to_viewer), si.sh_frame.n)
+    cos = dr.dot(si.sh_frame.n, to_viewer)
+    there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o)
+    turn = there & si.is_valid() & (horizon.side != 0)
+    n = dr.normalize(si.sh_frame.n + (horizon.side * BESIDE_HORIZON - cos) * to_viewer)
+    si.sh_frame.n = dr.select(turn, n, si.sh_frame.n)
     si.initialize_sh_frame()
-    si.wi = dr.select(away, si.to_local(to_viewer), si.wi)
+    si.wi = dr.select(turn, si.to_local(to_viewer), si.wi)
+
+
+#: Cosine to the viewer of a normal just beside the horizon.
+BESIDE_HORIZON = 1e-4

@@ -215,10 +215,10 @@ class RigIntegrator(EdgeIntegrator):
             weight = dr.detach(weight)
         choice = self._choice(sampler, seed)
         to = Splat(layers) if forward else Measure(layers)
-        outline = points.outline | dr.full(mi.Bool, False, count)
-        for sign, ray, ray_weight in zip((1, -1), points.rays, points.weights, strict=True):
+        sides = zip((1, -1), points.rays, points.weights, points.horizons, strict=True)
+        for sign, ray, ray_weight, horizon in sides:
             scale = ray_weight * (sign * weight)
-            paths.trace(to, sampler.clone(), ray, position, scale, choice, points.active, outline)
+            paths.trace(to, sampler.clone(), ray, position, scale, choice, points.active, horizon)
         if not forward:
             dr.eval(to.total, points.n_dl)
             with dr.resume_grad():

@@ -1,0 +1,211 @@
+"""Where interpolated normals turn away from the viewer: jumps inside of faces.
+
+On a smooth-shaded mesh the normal that shades, n, is interpolated between the vertices. Just inside of a silhouette it
+faces away from the viewer e, although the face does not: what a surface emits or reflects there is zero, or that of its
+other side. So the radiance jumps where
+
+    g(p) = n(p) · (e − p) = 0.
+
+On a line in a triangle, this is a quadratic equation, since n and p are linear along it. So each line from a corner c of
+the triangle to a point of the side opposite, from a to b, meets the curve where
+
+    p(s, t) = c + t ((1 − s) (a − c) + s (b − c)),        s, t in [0, 1],   g(p(s, t)) = 0.
+
+If g has different signs at the corners, c is the one that is alone with its sign, and each line meets the curve once. If
+not, the curve may still enter and leave through one side: then c is the corner opposite, and s is between the two.
+
+As vertices, normals and viewer move, t follows by one step of Newton's method, whose derivative is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .device_edges import passes
+from .meshes import Geometry, has_interpolated_normals
+
+
+@dataclass
+class Horizon:
+    """On which side of such a curve the first vertex of a path is.
+
+    side : mi.Float, (N,); +1: its normal just faces the viewer; −1: it just faces away; 0: it is as it is.
+    p : mi.Point3f, (N,), the point of the curve, world space: what hides it is none of its sides.
+    """
+
+    side: mi.Float
+    p: mi.Point3f
+
+
+@dataclass
+class HorizonPoint:
+    """A point of a curve.
+
+    p : mi.Point3f, world space; attached to vertices, normals and viewer.
+    tangent : mi.Vector3f, dp/ds. Detached.
+    facing : mi.Vector3f, towards where normals face the viewer. Detached.
+    valid : mi.Bool, is there one?
+    """
+
+    p: mi.Point3f
+    tangent: mi.Vector3f
+    facing: mi.Vector3f
+    valid: mi.Bool
+
+
+class Horizons:
+    """The curves in the faces of smooth-shaded meshes.
+
+    Parameters
+    ----------
+    geometry : the shapes.
+    moving : which of its meshes can move over the film.
+    """
+
+    DRJIT_STRUCT = dict.fromkeys(("count", "_corners", "_sign"))  # for `dr.freeze`
+
+    def __init__(self, geometry: Geometry, moving: np.ndarray):
+        self.geometry = geometry
+        smooth = [bool(m) and has_interpolated_normals(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
+        faces = geometry.faces(tuple(smooth))
+        self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
+        signs = [
+            np.full(m.face_count(), _sign(m), np.float32) for m, s in zip(geometry.meshes, smooth, strict=True) if s
+        ]
+        # Not in NumPy's memory, for frozen functions.
+        self._sign = mi.Float(np.concatenate(signs)) * dr.opaque(mi.Float, 1) if signs else None
+        #: Number of faces.
+        self.count = len(faces)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def _face(self, positions: mi.Float, normals: mi.Float, face: mi.UInt32) -> tuple[list, list]:
+        """Corners of faces, and the normals there, not normalised, as Mitsuba has them."""
+        corners = [dr.gather(mi.UInt32, c, face) for c in self._corners]
+        sign = dr.gather(mi.Float, self._sign, face)
+        p = [dr.gather(mi.Point3f, positions, c) for c in corners]
+        return p, [sign * dr.gather(mi.Vector3f, normals, c) for c in corners]
+
+    def chords(
+        self, positions: mi.Float, normals: mi.Float, face: mi.UInt32, eye: mi.Point3f, far: bool, radius: mi.Float
+    ) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
+        """About where the curve is: where it enters and leaves the face; of faces without one, which may have one as
+        seen from another point of the lens, the longest side. Detached.
+
+        eye : world space; or, if `far`, the direction towards the viewer. radius : of the lens around it.
+
+        Returns
+        -------
+        a, b : the end points. valid : mi.Bool, may there be a curve?
+        """
+        with dr.suspend_grad():
+            p, n = self._face(positions, normals, face)
+            near = mi.Bool(False)
+            for q, normal in zip(p, n, strict=True):
+                near |= dr.abs(_towards(q, normal, eye, far)) <= dr.norm(normal) * radius
+            p, n, start, end, there = _arrange(p, n, eye, far)
+            ends = []
+            for s in (start, end):
+                D, N = dr.lerp(p[1] - p[0], p[2] - p[0], s), dr.lerp(n[1] - n[0], n[2] - n[0], s)
+                first, second = _roots(p[0], n[0], D, N, eye, far)
+                ends.append(p[0] + dr.clip(dr.select(_inside(first), first, second), 0, 1) * D)
+            longest = dr.squared_norm(p[2] - p[0]) > dr.squared_norm(p[1] - p[0])
+            sides = p[0], dr.select(longest, p[2], p[1])
+            return *(dr.select(there, c, side) for c, side in zip(ends, sides, strict=True)), there | near
+
+    def point(
+        self, positions: mi.Float, normals: mi.Float, face: mi.UInt32, u: mi.Float, eye: mi.Point3f, far: bool
+    ) -> HorizonPoint:
+        """The point u in [0, 1) of the curve in a face. `positions`, `normals` and `eye` may be attached."""
+        p, n = self._face(positions, normals, face)
+        p, n, start, end, valid = _arrange(p, n, dr.detach(eye), far)
+        s = dr.lerp(start, end, u)
+        D, N = dr.lerp(p[1] - p[0], p[2] - p[0], s), dr.lerp(n[1] - n[0], n[2] - n[0], s)
+        with dr.suspend_grad():
+            first, second = _roots(p[0], n[0], D, N, eye, far)
+            # If the line meets the curve twice, one of both, by what the choice of s has left of the random number.
+            both = _inside(first) & _inside(second) & (first != second)
+            lower = u * 4096 - dr.floor(u * 4096) < 0.5
+            t = dr.select(dr.select(both, lower, _inside(first)), first, second)
+            valid &= _inside(t)
+            t = dr.select(valid, t, 0)
+            normal, point = n[0] + t * N, p[0] + t * D
+            view, moves = (mi.Vector3f(eye), 0) if far else (mi.Vector3f(eye - point), 1)
+            g_t = dr.dot(N, view) - moves * dr.dot(normal, D)
+            g_s = t * (dr.dot(n[2] - n[1], view) - moves * dr.dot(normal, p[2] - p[1]))
+            tangent = t * mi.Vector3f(p[2] - p[1]) - (g_s / g_t) * mi.Vector3f(D)
+            tangent *= (end - start) * dr.select(both, mi.Float(2), 1)
+            length2 = dr.squared_norm(tangent)
+            valid &= (g_t != 0) & dr.isfinite(length2) & (length2 > 0)
+            facing = mi.Vector3f(D) * dr.sign(g_t)
+        now = _towards(p[0] + t * D, n[0] + t * N, eye, far)
+        follows = t - dr.select(valid, (now - dr.detach(now)) / dr.select(valid, dr.detach(g_t), 1), 0)
+        return HorizonPoint(mi.Point3f(p[0] + follows * D), dr.detach(tangent), dr.detach(facing), valid)
+
+    def passed(self, positions: mi.Float, face: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
+        """Do rays pass through faces? Detached."""
+        return passes(ray, [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, c, face)) for c in self._corners])
+
+
+def _towards(p: mi.Point3f, n: mi.Vector3f, eye: mi.Point3f, far: bool) -> mi.Float:
+    """g at a point with its normal."""
+    return dr.dot(n, mi.Vector3f(eye) if far else mi.Vector3f(eye - p))
+
+
+def _arrange(p: list, n: list, eye: mi.Point3f, far: bool) -> tuple[list, list, mi.Float, mi.Float, mi.Bool]:
+    """Corners and their normals, with the corner first from which the curve is looked for; the interval of s on the
+    side opposite; and is there a curve? All but the first two are detached."""
+    p, n = list(p), list(n)
+    with dr.suspend_grad():
+        front = [_towards(q, normal, eye, far) > 0 for q, normal in zip(p, n, strict=True)]
+        mixed = (front[0] != front[1]) | (front[0] != front[2])
+        dips = [mi.Bool(False)] * 3
+        if not far:
+            for k in range(3):
+                i, j = (k + 1) % 3, (k + 2) % 3
+                roots = _roots(p[i], n[i], p[j] - p[i], n[j] - n[i], eye, far)
+                dips[k] = ~mixed & _inside(roots[0]) & _inside(roots[1]) & (roots[0] != roots[1])
+        is_first = [
+            (front[1] != front[0]) & (front[1] != front[2]) | (dips[1] & ~dips[0]),
+            (front[2] != front[0]) & (front[2] != front[1]) | (dips[2] & ~dips[1] & ~dips[0]),
+        ]
+    for k, taken in zip((1, 2), is_first, strict=True):
+        for values in (p, n):
+            values[0], values[k] = dr.select(taken, values[k], values[0]), dr.select(taken, values[0], values[k])
+    with dr.suspend_grad():
+        roots = _roots(p[1], n[1], p[2] - p[1], n[2] - n[1], eye, far)
+        dip = dips[0] | dips[1] | dips[2]
+        start, end = dr.select(mixed, 0, dr.minimum(*roots)), dr.select(mixed, 1, dr.maximum(*roots))
+        return p, n, dr.detach(start), dr.detach(end), mixed | dip
+
+
+def _inside(t: mi.Float) -> mi.Bool:
+    """Written so that NaN is not."""
+    return (t >= 0) & (t <= 1)
+
+
+def _roots(p, n, D, N, eye, far: bool) -> tuple[mi.Float, mi.Float]:
+    """Where (n + t N) · (eye − p − t D) = 0; NaN where nowhere. Detached."""
+    p, n, D, N, eye = (dr.detach(mi.Vector3f(v)) for v in (p, n, D, N, eye))
+    if far:
+        t = -dr.dot(n, eye) / dr.dot(N, eye)
+        return t, t
+    view = eye - p
+    A, B, C = -dr.dot(N, D), dr.dot(N, view) - dr.dot(n, D), dr.dot(n, view)
+    q = -0.5 * (B + dr.mulsign(dr.sqrt(B * B - 4 * A * C), B))
+    return C / q, q / A
+
+
+def _sign(mesh: mi.Mesh) -> float:
+    """-1 if Mitsuba turns the normals of a mesh round ("flip_normals")."""
+    with dr.suspend_grad():
+        pi = dr.zeros(mi.PreliminaryIntersection3f)
+        pi.t, pi.prim_uv, pi.prim_index, pi.shape = mi.Float(1), mi.Point2f(1 / 3), mi.UInt32(0), mi.ShapePtr(mesh)
+        si = pi.compute_surface_interaction(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)), mi.RayFlags.All, True)
+        faces, normals = np.array(mesh.faces_buffer())[:3], np.array(mesh.vertex_normals_buffer()).reshape(-1, 3)
+        return -1.0 if float(np.array(si.sh_frame.n).ravel() @ normals[faces].sum(0)) < 0 else 1.0
