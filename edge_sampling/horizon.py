@@ -6,13 +6,13 @@ other side. So the radiance jumps where
 
     g(p) = n(p) · (e − p) = 0.
 
-On a line in a triangle, this is a quadratic equation, since n and p are linear along it. So each line from a corner c of
-the triangle to a point of the side opposite, from a to b, meets the curve where
+On a line in a triangle, this is a quadratic equation, since n and p are linear along it. So each line from a corner c
+of the triangle to a point of the side opposite, from a to b, meets the curve where
 
     p(s, t) = c + t ((1 − s) (a − c) + s (b − c)),        s, t in [0, 1],   g(p(s, t)) = 0.
 
-If g has different signs at the corners, c is the one that is alone with its sign, and each line meets the curve once. If
-not, the curve may still enter and leave through one side: then c is the corner opposite, and s is between the two.
+If g has different signs at the corners, c is the one that is alone with its sign, and each line meets the curve once.
+If not, the curve may still enter and leave through one side: then c is the corner opposite, and s is between the two.
 
 As vertices, normals and viewer move, t follows by one step of Newton's method, whose derivative is exact.
 """

@@ -41,8 +41,8 @@ STAGES = ((10, 6), (24, 24), (80, 96))
 #: The derivative is right if its projection on the reference is 1 within this, and `ERRORS` standard errors.
 TOLERANCE, ERRORS = 0.015, 4.0
 
-#: Sums over squares of so many pixels must agree within `TOLERANCE` of what the reference has there, and so many standard
-#: errors. (There are 16 of them, and their errors come from few runs.)
+#: Sums over squares of so many pixels must agree within `TOLERANCE` of what the reference has there, and so many
+#: standard errors. (There are 16 of them, and their errors come from few runs.)
 SQUARE, LARGEST = 5, 5.5
 
 #: A projection whose standard error is above this tells nothing: more samples are taken.
