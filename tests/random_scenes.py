@@ -159,23 +159,24 @@ class Generator:
         self.scale = self.pick(1.0, 1.0, 1.0, 1.0, 1e-3, 1e-2, 30.0, 1e4)
         self.origin = self.direction() * self.scale * self.pick(0, 0, 0, 3, 20)
         self.labels.append(f"x{self.scale:g}" + (f"@{np.linalg.norm(self.origin):g}" if self.origin.any() else ""))
-        direct = self.chance(0.6)
+        # What moves must not show instances, whose outlines are unknown: no sky, no gloss, no interreflections.
+        self.instances = self.chance(0.06)
+        direct = self.chance(0.6) or self.instances
         self.depth = depth = 2 if direct else int(self.rng.integers(2, 6))
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
 
-        instances = self.chance(0.06)
         self.make_sensor()
         self.make_floor()
         for i in range(self.rng.integers(1, 4)):
             self.make_thing(i)
-        if instances:
+        if self.instances:
             self.make_instances()
         kinds: list[str] = []
         for i in range(self.rng.integers(1, 3)):
             kinds.append(self.make_light(i, kinds))
         scene = mi.load_dict(self.objects)
-        params, move = self.make_motion(scene, cameras=not instances)
+        params, move = self.make_motion(scene, cameras=not self.instances)
         return RandomScene(scene, params, move, integrator, depth, " ".join(self.labels))
 
     # ---------------------- Placing ----------------------
@@ -208,7 +209,7 @@ class Generator:
     def bsdf(self, uv: bool = False, closed: bool = False) -> tuple[str, dict]:
         kinds = ["diffuse", "diffuse", "twosided", "roughplastic", "roughconductor", "principled", "blend"]
         kinds += ["roughdielectric"] * closed + ["texture", "texture", "normalmap"] * uv
-        kind = self.pick(*kinds)
+        kind = "diffuse" if self.instances else self.pick(*kinds)
         colour, alpha = self.colour(), self.uniform(0.1, 0.4)
         bsdf = {
             "diffuse": lambda: {"type": "diffuse", "reflectance": colour},
@@ -355,6 +356,7 @@ class Generator:
         lamp = self.chance(0.15)
         emitter = self.emitter(0.5, 3) if lamp else None
         smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
+        smooth &= not lamp or kind == "fine"  # the fringe of coarse lamps is missing in what they light
         label = f"{'smooth-' if smooth and kind != 'fine' else ''}{kind}:{material}{':lamp' if lamp else ''}"
         extra = {"bsdf": bsdf, **({"emitter": emitter} if lamp else {})}
         key, how = f"{name}.vertex_positions", "vertices"
@@ -410,7 +412,7 @@ class Generator:
         kind = self.pick(*kinds)
         if self.depth > 2 and kind in ("point", "spot", "sun"):
             kind = "area"  # hard shadows in indirect light are missing
-        if kind in ("sky", "environment") and {"sky", "environment"} & set(before):
+        if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
         centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])
         power, grey = self.uniform(0.5, 1.5), lambda v: {"type": "rgb", "value": v}
@@ -423,7 +425,9 @@ class Generator:
         elif kind == "meshball":
             n = self.pick(4, 8, 16)
             linear = self.rotation() * 0.4
-            made = self.mesh(name, ball(n), linear, centre, None, area(15 * power), self.chance(0.5), uv=False)
+            made = self.mesh(
+                name, ball(n), linear, centre, None, area(15 * power), self.chance(0.5) and n > 8, uv=False
+            )
             moves += [(f"{name}.vertex_positions", "vertices", centre)] * 2
         elif kind in ("ball", "disklight"):
             shape, linear = ("sphere", np.eye(3)) if kind == "ball" else ("disk", down)

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from random_scenes import ball
 
 from rimlight.edge_sampling import Geometry, Motion, derivative_image, find_edges, t_junctions
 
@@ -197,3 +198,14 @@ def test_gradients_of_media_are_refused(key):
         RuntimeError, match=r"(sigma_t|albedo)\S* .*carries a gradient, but participating media are not"
     ):
         mi.load_dict({"type": "direct_edge"}).render_forward(scene, params, spp=1)
+
+
+@pytest.mark.parametrize("coarse", [True, False])
+def test_fringe_of_coarse_lamps(coarse):
+    """The interpolated normals of a coarse ball turn away well inside of its outline."""
+    points, _, _, faces = ball(4 if coarse else 40)
+    lamp = cases.mesh("lamp", 0.3 * points + [0, 2, 0], faces, normals=True, emitter=cases.light(3, 2, 1))
+    floor = cases.horizontal((0, 0, 0), 2, "floor", bsdf=cases.diffuse(0.5))
+    scene = cases.scene(sensor=cases.camera(), lamp=lamp, floor=floor)
+    found = [message for message in said(scene, "lamp.vertex_positions") if "coarse mesh" in message]
+    assert len(found) == coarse and all('"lamp"' in message for message in found)

@@ -10,7 +10,7 @@ import numpy as np
 
 from rimlight._plan import names
 from rimlight.edge_sampling import film_parts, objects_below
-from rimlight.edge_sampling.meshes import vertices
+from rimlight.edge_sampling.meshes import faces, has_interpolated_normals, vertices
 
 #: What perfect mirrors and glass do.
 MIRRORS = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
@@ -96,6 +96,33 @@ class Media:
                         f'{who}: "{name}.{key}" ({medium.class_name()}) carries a gradient, but participating media '
                         "are not supported. Detach it, or use Mitsuba's prbvolpath."
                     )
+
+
+def coarse_lamps(scene: mi.Scene) -> list[str]:
+    """What the derivative lacks of the light of smooth-shaded meshes: as seen from the surfaces that they light, their
+    emission ends where the interpolated normals turn away, inside of their outline."""
+    limits = []
+    for e in scene.emitters():
+        shape = e.get_shape()
+        if shape is None or not shape.is_mesh() or not has_interpolated_normals(shape):
+            continue
+        corners, normals = faces(shape), np.array(dr.detach(shape.vertex_normals_buffer())).reshape(-1, 3)
+        p = vertices(shape)[corners].astype(np.float64)
+        flat = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None]
+        n = normals[corners]
+        size = np.linalg.norm(flat, axis=2) * np.linalg.norm(n, axis=2)
+        cos = np.abs((flat * n).sum(2))[size > 0] / size[size > 0]
+        if cos.size and 1 - cos.min() > FRINGE:
+            limits.append(
+                f"the derivative lacks part of the light of {names([shape])[0]}, about {100 * (1 - cos.min()):.1g} % "
+                "of its extent: where the interpolated normals of its coarse mesh turn away, as seen from what it "
+                "lights. Give it a finer mesh or face normals."
+            )
+    return limits
+
+
+#: Part of its extent by which a lamp may end inside of its outline, without a warning.
+FRINGE = 0.005
 
 
 def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
