@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: setup demo test bench docs lint clean
+.PHONY: setup demo test test-full bench docs lint clean
 
 setup: $(STAMP)
 
@@ -23,6 +23,11 @@ demo: setup
 # Two workers, each with all threads: the compiler, not the kernels, is what small tests wait for
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
+
+# The same, with random ordinary scenes: 300 take about an hour, or as many as: make test-full SCENES=1000
+SCENES ?= 300
+test-full: setup
+	RIMLIGHT_SCENES=$(SCENES) $(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
 
 # All of them take about three quarters of an hour; or one: make bench NAME=scaling
 NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illumination scaling rig integration reflectance photometric_stereo single_image

@@ -48,8 +48,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     lines in which meshes cut through each other, or the far clipping plane through them, the borders of hard beams,
     and shadows of hair, instances, ... on what moves. Warned about, too: jumps at T-junctions, which count twice,
     and participating media, which are taken for empty (derivatives with respect to their parameters are refused).
-    At the outline of a smooth-shaded mesh, the dark fringe of normals that face away is taken as infinitely thin
-    (see the theory), which leaves a bias of the order of its width: about 2 % on a torus of 48 × 24 quads at 32².
+    So is the light of smooth-shaded lamps with coarse meshes, of which a fringe is missing.
     Polarised variants are refused. With filters other than ``box``, the ratio of sums that makes a pixel has a bias
     of order 1/spp, as it has in the image.
 
