@@ -223,8 +223,11 @@ class FilmBoundary:
             if self.edges is not None:
                 active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, index, 0), p, rays))
             if self.horizons is not None:
-                # Beside a silhouette that is closer than the rays look, the silhouette has this jump already.
-                active &= ~is_horizon | self.horizons.passed(positions, face, rays[0])
+                # Beside a silhouette that is closer than the rays look, the silhouette has this jump already: the ray
+                # on the dark side must still see a surface that is dark.
+                on_dark_side = active & is_horizon & ~self.horizons.passed(positions, face, rays[0])
+                si = scene.ray_intersect(rays[0], mi.RayFlags.All, True, on_dark_side)
+                active &= ~on_dark_side | (si.is_valid() & (dr.dot(si.sh_frame.n, rays[0].d) > 0))
             if self.curves is not None:
                 # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
                 # that: a jump of the contour's, which would count twice.
