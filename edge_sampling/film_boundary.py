@@ -59,7 +59,7 @@ class BoundaryPoints:
     rays     : that look beside the edge, on its − and on its + side.
     weights  : of these rays.
     active   : mi.Bool, (N,)
-    horizons : on which side of a horizon of interpolated normals each of the rays is.
+    horizons : on which side of a horizon of interpolated normals each of the rays is; None where there are none.
     sensor_moves : does the velocity depend on parameters of the sensor?
     """
 
@@ -69,7 +69,7 @@ class BoundaryPoints:
     rays: list[mi.RayDifferential3f]
     weights: list[mi.Spectrum]
     active: mi.Bool
-    horizons: list[Horizon]
+    horizons: list[Horizon | None]
     sensor_moves: bool
 
 
@@ -107,7 +107,7 @@ class FilmBoundary:
         sensor: mi.Sensor,
         sampler: mi.Sampler,
         count: int,
-        radiance: Callable[[mi.RayDifferential3f, mi.Sampler, mi.Bool, Horizon], tuple[mi.Spectrum, mi.Float]],
+        radiance: Callable[..., tuple[mi.Spectrum, mi.Float]],
     ) -> BoundarySamples:
         """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
 
@@ -234,10 +234,9 @@ class FilmBoundary:
                 wall = projection.tangent(c.p, mi.Point3f(c.p + c.inwards), mi.Float(0), aperture_sample)
                 missed = [self.curves.misses(frames, piece, ray) for ray in rays]
                 active &= ~is_curve | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
-            side = dr.zeros(mi.Float, count)
+            horizons = [None, None]
             if self.horizons is not None:
-                side = dr.select(is_horizon, mi.Float(1), 0)
-            horizons = [Horizon(sign * side, p) for sign in (-1, 1)]
+                horizons = [Horizon(dr.select(is_horizon, mi.Float(sign), 0), p) for sign in (-1, 1)]
             n_dl = dr.select(active, n_dl, 0)
             return BoundaryPoints(u, n_dl, velocity, rays, weights, active, horizons, projection.attached)
 

@@ -207,5 +207,8 @@ def _sign(mesh: mi.Mesh) -> float:
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.t, pi.prim_uv, pi.prim_index, pi.shape = mi.Float(1), mi.Point2f(1 / 3), mi.UInt32(0), mi.ShapePtr(mesh)
         si = pi.compute_surface_interaction(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)), mi.RayFlags.All, True)
-        faces, normals = np.array(mesh.faces_buffer())[:3], np.array(mesh.vertex_normals_buffer()).reshape(-1, 3)
+        faces, normals = (
+            np.array(mesh.faces_buffer())[:3],
+            np.array(dr.detach(mesh.vertex_normals_buffer())).reshape(-1, 3),
+        )
         return -1.0 if float(np.array(si.sh_frame.n).ravel() @ normals[faces].sum(0)) < 0 else 1.0

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from random_scenes import STAGES, Comparison, compare, make, statistics
 
-#: What once came out wrong, or not finite, and a few others.
-FEW = (15, 25, 42, 49, 51, 57, 65, 71)
+#: With lamps, textures, environment maps and lenses among them; each takes a few seconds.
+FEW = (5, 9, 17, 30, 36, 44, 48, 83)
 SEEDS = range(int(os.environ["RIMLIGHT_SCENES"])) if "RIMLIGHT_SCENES" in os.environ else FEW
 
 
@@ -42,7 +42,7 @@ def test_comparison_is_not_biased_by_noise(noise):
     scales = []
     for k in range(20):
         row = Comparison(0, "")
-        statistics(runs(truth, noise, 10, 2 * k), runs(truth, noise, 6, 2 * k + 1), row)
+        statistics(runs(truth, noise, 24, 2 * k), runs(truth, noise, 24, 2 * k + 1), row)
         assert row.agrees
         scales.append((row.scale, row.error))
     scale, error = np.array(scales).T
