@@ -240,10 +240,9 @@ class Scattering:
         now = dr.detach(geometry)
         relative = dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
         still = active & flush(si, y)
-        if self.any_curved:
-            still |= grazes(y, ω, active)
+        fixed = still | grazes(y, ω, active) if self.any_curved else still
         y = dr.select(still, dr.detach(y), y)
-        return y, dr.select(still, dr.detach(ω), ω), dr.select(still, dr.detach(relative), relative), still
+        return y, dr.select(still, dr.detach(ω), ω), dr.select(fixed, dr.detach(relative), relative), still
 
     def _area(self, pi, ray, active):
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
