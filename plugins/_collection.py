@@ -37,14 +37,18 @@ class _Collector:
                     self.set_aside = False
             self.guards += 1
 
-    def on(self) -> None:
+    def on(self, raised: bool) -> None:
         with self.lock:
             self.guards -= 1
             if self.guards or not self.enabled:
                 return
             # The rest of a function that `dr.freeze` records does not belong to us. Nobody tells when it ends: let the
-            # collector go on, but not see what is there already. (Unless the user has done the same.)
-            if dr.flag(dr.JitFlag.FreezingScope) and not gc.get_freeze_count():
+            # collector go on, but not see what is there already. (Unless the user has done the same.) An exception ends
+            # the recording, and what its traceback holds is to be collected.
+            if raised and self.set_aside:
+                gc.unfreeze()
+                self.set_aside = False
+            elif dr.flag(dr.JitFlag.FreezingScope) and not raised and not gc.get_freeze_count():
                 gc.freeze()
                 self.set_aside = True
             gc.enable()
@@ -81,12 +85,14 @@ def no_collection() -> Iterator[None]:
     # The generator that Python has made for this function is an allocation, and with it comes the collection that is
     # due, if one is. That costs a loop of short steps nothing, where `gc.collect()` in each would be most of its time.
     _collector.off()
+    raised = True
     try:
         _evaluate()
         yield
         _evaluate()
+        raised = False
     finally:
-        _collector.on()
+        _collector.on(raised)
 
 
 def collect_before() -> None:
