@@ -35,7 +35,9 @@ def searches(monkeypatch):
         found.append(geometry)
         return find_welded_edges(geometry)
 
-    monkeypatch.setattr("rimlight.integrators._edge_integrator.find_welded_edges", search)
+    # Not by the name of the module: each variant has one of its own.
+    base = next(c for c in type(direct_edge()).__mro__ if c.__name__ == "EdgeIntegrator")
+    monkeypatch.setitem(base._renew.__globals__, "find_welded_edges", search)
     return found
 
 
