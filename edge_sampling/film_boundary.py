@@ -32,6 +32,9 @@ from .projection import Projection, inside_frame
 #: an edge that cannot be seen changes nothing, not even the last bit.
 LENGTH_UNIT = 2.0**-16
 
+#: How far beside the edges of meshes that light goes through to look, in units of the offset of Mitsuba's rays.
+BEHIND = 8
+
 
 @dataclass(frozen=True)
 class BoundarySamples:
@@ -84,7 +87,9 @@ class FilmBoundary:
     lights : of the scene.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "horizons", "curves", "counts", "lights"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(
+        ("edges", "corners", "horizons", "curves", "counts", "lights", "transmits")
+    )  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights):
         self.geometry, self.lights = geometry, lights
@@ -97,6 +102,9 @@ class FilmBoundary:
         self.curves = Curves(shapes) if shapes else None
         horizons = Horizons(geometry, moving[: len(geometry.meshes)])
         self.horizons = horizons if len(horizons) else None
+        bsdfs = [m.bsdf() for m, moves in zip(geometry.meshes, moving, strict=False) if moves]
+        #: Does light go through a mesh?
+        self.transmits = any(b is not None and b.flags() & mi.BSDFFlags.Transmission for b in bsdfs)
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
         cuts = len(faces) if len(edges) else 0
         self.counts = (len(edges), cuts, len(horizons), len(self.curves) if shapes else 0)
@@ -359,6 +367,10 @@ class FilmBoundary:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart."""
         ulp = dr.epsilon(mi.Float) * 2
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
-        in_world = 8 * ulp * largest * projection.pixels_per_unit(projection.film(p))
+        in_world = 8 * ulp * largest
+        if self.transmits:
+            # Mitsuba's rays start so far from a surface: beside the edge of glass, beyond the face on the other side.
+            in_world += BEHIND * mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+        in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film
