@@ -102,12 +102,14 @@ class FilmBoundary:
         self.curves = Curves(shapes) if shapes else None
         horizons = Horizons(geometry, moving[: len(geometry.meshes)])
         self.horizons = horizons if len(horizons) else None
-        bsdfs = [m.bsdf() for m, moves in zip(geometry.meshes, moving, strict=False) if moves]
-        #: Does light go through a mesh?
-        self.transmits = any(b is not None and b.flags() & mi.BSDFFlags.Transmission for b in bsdfs)
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
         cuts = len(faces) if len(edges) else 0
         self.counts = (len(edges), cuts, len(horizons), len(self.curves) if shapes else 0)
+        bsdfs = [m.bsdf() for m, moves in zip(geometry.meshes, moving, strict=False) if moves]
+        #: Does light go through a mesh? Not where there are horizons, which may be closer to a silhouette.
+        self.transmits = self.horizons is None and any(
+            b is not None and b.flags() & mi.BSDFFlags.Transmission for b in bsdfs
+        )
 
     def sample(
         self,

@@ -129,6 +129,7 @@ class Generator:
         self.sampler = sampler
         self.objects: dict[str, Any] = {"type": "scene"}
         self.labels: list[str] = []
+        self.lights: list[np.ndarray] = []
         #: What may change: name of the parameter, and how.
         self.movable: dict[str, list[tuple[str, str, np.ndarray]]] = {
             "thing": [],
@@ -415,6 +416,10 @@ class Generator:
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
         centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])
+        for other in self.lights:
+            if np.linalg.norm(centre - other) < 1.3:  # so that lights do not cut each other
+                centre = other + 1.3 * np.array([-1 if other[0] > 0 else 1, 0, 0])
+        self.lights.append(centre)
         power, grey = self.uniform(0.5, 1.5), lambda v: {"type": "rgb", "value": v}
         area = lambda v: {"type": "area", "radiance": grey(v)}
         down = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
