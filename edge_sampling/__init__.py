@@ -1,7 +1,7 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
 from .batch import Batch, FilmPart, film_parts
-from .edge_importance import Cone, EdgeSample, Lobe, View, resample, sample_edge, stratified
+from .edge_importance import Cone, EdgeSample, Lobe, View, power_heuristic, resample, sample_edge, stratified
 from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .film_boundary import BoundarySamples, FilmBoundary
@@ -15,6 +15,7 @@ from .projection import Projection
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary, ShadowSamples
 from .silhouettes import Silhouettes
+from .smooth_lamps import SmoothLamps
 from .sources import Sources
 from .zscores import mean_and_error, z_scores
 
@@ -40,6 +41,7 @@ __all__ = [
     "ShadowBoundary",
     "ShadowSamples",
     "Silhouettes",
+    "SmoothLamps",
     "Sources",
     "View",
     "Weld",
@@ -53,6 +55,7 @@ __all__ = [
     "jumping_textures",
     "mean_and_error",
     "objects_below",
+    "power_heuristic",
     "resample",
     "sample_edge",
     "stratified",

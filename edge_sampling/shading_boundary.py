@@ -28,6 +28,7 @@ from .device_edges import beside_edge
 from .edge_importance import EdgeSample, Lobe, View, power_heuristic, resample
 from .emitter_boxes import EmitterBoxes
 from .silhouettes import Placement, Silhouettes
+from .smooth_lamps import SmoothLamps
 
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
@@ -54,13 +55,15 @@ class ShadingBoundary:
     """
 
     _NUMBERS = ("transmits", "glossy", "emission", "emission_at_first", "several")
-    DRJIT_STRUCT = dict.fromkeys(("silhouettes", "boxes", "moving_shapes", "lights", *_NUMBERS))  # for `dr.freeze`
+    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps")
+    DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None):
         self.silhouettes = silhouettes
         self.geometry = geometry = silhouettes.geometry
         self.moving_shapes = None if moving is None else [mi.ShapePtr(s) for s in moving]
         self.boxes = EmitterBoxes(scene, geometry)
+        self.smooth_lamps = SmoothLamps(scene)
         emitters = scene.emitters()
         #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
         lights = [i for i, e in enumerate(emitters) if not e.flags() & mi.EmitterFlags.Delta]
@@ -240,8 +243,12 @@ class ShadingBoundary:
                 mine = lit & share_emission & (emitter == mi.EmitterPtr(several))
                 L = dr.select(mine, several.eval_background(y, mine), L)
             shared = lit & share_emission & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-            light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared)
-            L *= dr.select(shared, power_heuristic(pdf, light_pdf), 1)
+            on_smooth = lit & ~shared & self.smooth_lamps.are(y.shape) if len(self.smooth_lamps) else mi.Bool(False)
+            light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared | on_smooth)
+            mis = power_heuristic(pdf, light_pdf)
+            L *= dr.select(shared, mis, 1)
+            if len(self.smooth_lamps):
+                L *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
             valid = active & y.is_valid()
             if scattered is not None:
                 reflected = valid & ~emission

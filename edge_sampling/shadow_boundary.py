@@ -26,6 +26,7 @@ from .edge_importance import View, power_heuristic
 from .lights import Lights
 from .projection import Projection, inside_frame
 from .silhouettes import Silhouettes
+from .smooth_lamps import SmoothLamps
 
 
 def throws_shadows(emitter: mi.Emitter) -> bool:
@@ -62,11 +63,13 @@ class ShadowBoundary:
     silhouettes : what throws shadows; refitted by the caller.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("silhouettes", "lights", "chosen", "any_surface", "any_other"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(
+        ("silhouettes", "lights", "smooth_lamps", "chosen", "any_surface", "any_other")
+    )  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
         self.silhouettes = silhouettes
-        self.lights = Lights(scene)
+        self.lights, self.smooth_lamps = Lights(scene), SmoothLamps(scene)
         emitters = scene.emitters()
         #: Numbers of the lights whose shadows are sampled.
         self.chosen = mi.UInt32([k for k, i in enumerate(self.lights.emitter) if throws_shadows(emitters[i])])
@@ -196,13 +199,17 @@ class ShadowBoundary:
                 ω_x = dr.select(on_surface, dr.normalize(to_light), ω_x)
                 emitting = active & on_surface
                 on_light = met.compute_surface_interaction(onwards, mi.RayFlags.All, emitting)
-                Le = emitter.eval(on_light, emitting) * (dr.abs_dot(n, ω_x) / dr.squared_norm(to_light))
-                L = dr.select(on_surface, Le, L)
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω_x), active)
-            if share and self.any_surface:
-                ds = mi.DirectionSample3f(scene, on_light, si)
-                light_pdf = scene.pdf_emitter_direction(si, ds, emitting)
-                L *= dr.select(on_surface, power_heuristic(light_pdf, pdf), 1)
+            if self.any_surface:
+                cos, mis = dr.abs_dot(n, ω_x), mi.Float(1)
+                if share or len(self.smooth_lamps):
+                    ds = mi.DirectionSample3f(scene, on_light, si)
+                    light_pdf = scene.pdf_emitter_direction(si, ds, emitting)
+                    mis = power_heuristic(light_pdf, pdf)
+                if len(self.smooth_lamps) and not share:
+                    cos, mis = self.smooth_lamps.cosine(on_light, ω_x, mis), 1
+                Le = emitter.eval(on_light, emitting) * (cos / dr.squared_norm(to_light))
+                L = dr.select(on_surface, Le * mis, L)
             jump = dr.select(active, f * L * ray_weight, 0)
 
             # ---------------------- The boundary on the film ----------------------

@@ -7,6 +7,7 @@ with respect to its pixels weighs a second, independent render, backward. Both a
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -76,6 +77,7 @@ class Renderer:
         kind = options.pop("type")
         define = [f"{key}={value}" for key, value in problem.define.items()]
         paths = [target.scene or problem.scene for target in problem.target]
+        gc.collect()  # as long as a scene that nobody needs exists, its materials are in all kernels that are compiled
         # Every load of a scene costs memory that never comes back.
         scenes = {path: load_scene(path, define) for path in dict.fromkeys(paths)}
         # One for each: ours remember the edges of the last scene.

@@ -12,6 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from random_scenes import ball
 
 REFERENCES = Path(__file__).parent / "references"
 SHARED = Path(__file__).parents[2] / "shared" / "data"  # beside the project; not everybody has it
@@ -320,6 +321,15 @@ def glowing_torus() -> mi.Scene:
         torus=torus(bsdf=diffuse(0.5), emitter=light(3, 2, 1)),
         floor=horizontal((0, -1.2, 0), 3, "floor", bsdf=diffuse(0.5)),
     )
+
+
+def coarse_lamp() -> mi.Scene:
+    """A ball of 224 triangles with interpolated normals, above the frame, lights a floor past a cube."""
+    points, _, _, faces = ball(8)
+    lamp = mesh("light", 0.8 * points + [0.3, 3, 0.2], faces, bsdf=diffuse(0), emitter=light(9, 8, 7), normals=True)
+    cube = mesh("cube", 0.3 * cube_vertices() + [0.1, 0.3, 0], CUBE_FACES, bsdf=diffuse(0.5))
+    floor = horizontal((0, -0.5, 0), 2, "floor", bsdf={"type": "roughconductor", "alpha": 0.4})
+    return scene(sensor=camera(), light=lamp, cube=cube, floor=floor)
 
 
 def lamps_that_reflect() -> mi.Scene:
@@ -882,6 +892,8 @@ CASES = [
     ),
     Case("glowing_torus", glowing_torus, UP, 6e-3, 0.04, spp=256, runs=24, reference_spp=4096),
     Case("glowing_torus_camera", glowing_torus, CAMERA_UP, 6e-3, 0.04, spp=256, runs=24, reference_spp=4096),
+    Case("coarse_lamp", coarse_lamp, LIGHT_SIDE, 1.2e-2, 0.04, spp=1024, largest_z=7),
+    Case("coarse_lamp_cube", coarse_lamp, SIDE, 1.2e-2, 0.03, runs=36),
     Case("reflecting_ball", lamps_that_reflect, THING_SIDE, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096),
     Case("reflecting_cube", lamps_that_reflect, SIDE, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096),
     Case("reflecting_camera", lamps_that_reflect, CAMERA_X, 6e-3, 0.03, spp=256, runs=24, reference_spp=4096),

@@ -357,7 +357,7 @@ class Generator:
         lamp = self.chance(0.15)
         emitter = self.emitter(0.5, 3) if lamp else None
         smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
-        smooth &= not lamp or kind == "fine"  # the fringe of coarse lamps is missing in what they light
+        smooth &= not lamp or kind == "fine"  # what coarse lamps light is off by some per cent, with a warning
         label = f"{'smooth-' if smooth and kind != 'fine' else ''}{kind}:{material}{':lamp' if lamp else ''}"
         extra = {"bsdf": bsdf, **({"emitter": emitter} if lamp else {})}
         key, how = f"{name}.vertex_positions", "vertices"
@@ -431,7 +431,7 @@ class Generator:
             n = self.pick(4, 8, 16)
             linear = self.rotation() * 0.4
             made = self.mesh(
-                name, ball(n), linear, centre, None, area(15 * power), self.chance(0.5) and n > 8, uv=False
+                name, ball(n), linear, centre, None, area(15 * power), self.chance(0.5) and n > 4, uv=False
             )
             moves += [(f"{name}.vertex_positions", "vertices", centre)] * 2
         elif kind in ("ball", "disklight"):

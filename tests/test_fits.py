@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
 
 import mitsuba as mi
 import numpy as np
@@ -244,7 +245,15 @@ def test_sgd_has_momentum():
     np.testing.assert_allclose(moved, 0.005 * np.cumsum(0.5 ** np.arange(4)), rtol=1e-3)
 
 
-def test_interruption(caplog):
+@pytest.fixture
+def ctrl_c_interrupts() -> Iterator[None]:
+    """Shells start what they run in the background with this signal ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_interruption(caplog, ctrl_c_interrupts):
     interrupt = lambda *result: (os.kill(os.getpid(), signal.SIGINT), result)[1]
     before = signal.getsignal(signal.SIGINT)
     found = fit(triangles(MATERIAL, steps=1000), executor=Valley({15: interrupt}))

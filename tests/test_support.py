@@ -297,7 +297,7 @@ class Chart:
         things = {f"thing{k}": self._thing(k, name, folder) for k, name in enumerate(self.names)}
         if column == "passed":
             things["plates"] = self._plates()
-        self.scene = cases.scene(
+        scene = cases.scene(
             sensor={"type": "orthographic", "to_world": view, "film": film},
             lamp={
                 "type": "rectangle",
@@ -308,8 +308,9 @@ class Chart:
             environment=cases.constant(0.3),
             **things,
         )
-        self.motion = Together(tuple(self._motions(column)))
-        self.step = 1e-2
+        #: Mean derivative and its standard error, and the finite differences. The scene itself is not kept: as long as
+        #: it lived, every kernel of every other test would contain its many materials.
+        self.measured = self._measure(scene, Together(tuple(self._motions(column, scene))))
 
     def place(self, k: int) -> np.ndarray:
         i, j = k % self.columns, k // self.columns
@@ -326,29 +327,27 @@ class Chart:
             "plates", p, np.arange(len(p)).reshape(-1, 3)[:, ::-1], bsdf=cases.diffuse(0.3, two_sided=True)
         )
 
-    def _motions(self, column: str):
+    def _motions(self, column: str, scene: mi.Scene):
         if column == "passed":
-            yield Motion(self.scene, "plates.vertex_positions", direction=[1, 0.3, 0.1])
+            yield Motion(scene, "plates.vertex_positions", direction=[1, 0.3, 0.1])
             return
         for k, name in enumerate(self.names):
             if column == "moves":
-                yield Motion(self.scene, f"thing{k}.vertex_positions", direction=[1, 0.3, 0.2])
+                yield Motion(scene, f"thing{k}.vertex_positions", direction=[1, 0.3, 0.2])
             else:
                 cell = CELLS[name]
                 key = f"thing{k}.{cell.change}" if cell.shape else f"thing{k}.bsdf.{cell.change}"
-                yield Motion(self.scene, key, direction=cell.direction)
+                yield Motion(scene, key, direction=cell.direction)
 
-    @cache  # noqa: B019 (a chart lives as long as the file's tests)
-    def measure(self):
-        """Mean derivative and its standard error, and the finite differences."""
-        expected = reference(f"chart_{self.column}", self.names, self.scene, self.motion, step=self.step, spp=1024)
+    def _measure(self, scene: mi.Scene, motion: Together):
+        expected = reference(f"chart_{self.column}", self.names, scene, motion, step=1e-2, spp=1024)
         integrator = mi.load_dict({"type": "direct_edge"})
-        images = [derivative_image(self.scene, integrator, self.motion, spp=128, seed=100 + i) for i in range(16)]
+        images = [derivative_image(scene, integrator, motion, spp=128, seed=100 + i) for i in range(16)]
         return *mean_and_error(np.array(images, np.float64)), expected
 
     def compare(self, name: str) -> tuple[float, float, float]:
         """Relative L1 error in the cell of a row, how much of it is noise, and the largest |z|."""
-        mean, error, stored = self.measure()
+        mean, error, stored = self.measured
         k = self.names.index(name)
         i, j = PIXELS * (k % self.columns), PIXELS * (k // self.columns)
         part = lambda a: a[j : j + PIXELS, i : i + PIXELS]
@@ -468,7 +467,7 @@ IN_LIGHT = [(r, c) for (r, c), text in ROWS.items() if text.startswith("exact") 
 
 @cache
 def light_images(trio: tuple[str, ...], column: str):
-    """As `Chart.measure`."""
+    """As `Chart.measured`."""
     scene = stage({f"lamp{i}": lamp(LAMPS[row][0], i) for i, row in enumerate(trio)})
     if column == "passed":
         motions = [Motion(scene, "plate.vertex_positions", **SIDEWAYS)]

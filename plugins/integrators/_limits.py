@@ -99,8 +99,8 @@ class Media:
 
 
 def coarse_lamps(scene: mi.Scene) -> list[str]:
-    """What the derivative lacks of the light of smooth-shaded meshes: as seen from the surfaces that they light, their
-    emission ends where the interpolated normals turn away, inside of their outline."""
+    """What the derivative lacks of the light that smooth-shaded meshes throw: Mitsuba reckons it with interpolated
+    normals, but faces turn away one after the other, each while its light is not yet 0."""
     limits = []
     for e in scene.emitters():
         shape = e.get_shape()
@@ -114,14 +114,14 @@ def coarse_lamps(scene: mi.Scene) -> list[str]:
         cos = np.abs((flat * n).sum(2))[size > 0] / size[size > 0]
         if cos.size and 1 - cos.min() > FRINGE:
             limits.append(
-                f"the derivative lacks part of the light of {names([shape])[0]}, about {100 * (1 - cos.min()):.1g} % "
-                "of its extent: where the interpolated normals of its coarse mesh turn away, as seen from what it "
-                "lights. Give it a finer mesh or face normals."
+                f"where the light of {names([shape])[0]} falls, the derivative is off by up to about "
+                f"{100 * (1 - cos.min()):.1g} %, since Mitsuba shades the faces of its coarse mesh with interpolated "
+                "normals. Give it a finer mesh or face normals."
             )
     return limits
 
 
-#: Part of its extent by which a lamp may end inside of its outline, without a warning.
+#: How far the cosine between the normals of faces and vertices of a lamp may be below 1, without a warning.
 FRINGE = 0.005
 
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import mis_weight
 
-from rimlight.edge_sampling import Horizon
+from rimlight.edge_sampling import Horizon, SmoothLamps
 from rimlight.edge_sampling.device_edges import rounding
 
 from ._limits import divides_by_density
@@ -31,6 +31,37 @@ class Next:
     through: mi.Bool
 
 
+@dataclass
+class Connection:
+    """What joins a point to a material point y that a ray from there meets. Attached.
+
+    y : mi.SurfaceInteraction3f.
+    ω : mi.Vector3f, the direction to it.
+    geometry : mi.Float, |cos θ_y| dA / r², relative to its present value.
+    still : mi.Bool, is all of this taken to stand still, since rounding would make its derivative? Then it is detached.
+    smooth : mi.Bool, is y on one of the `SmoothLamps`, and does not stand still?
+    spread : mi.Float, if so: the solid angle of an element of area there, as light samples reckon it, relative to its
+        present value.
+    """
+
+    y: mi.SurfaceInteraction3f
+    ω: mi.Vector3f
+    geometry: mi.Float
+    still: mi.Bool
+    smooth: mi.Bool
+    spread: mi.Float
+
+    def attach(self, weight: mi.Float, p: mi.Float, q: mi.Float, spread: mi.Float) -> mi.Float:
+        """Attach a weight of multiple importance sampling where y is on one of the `SmoothLamps`.
+
+        p, q : the densities of which it is made.
+        spread : what q / p is proportional to, if `p` and `q` know no more of it.
+        """
+        attached = self.smooth & (self.spread > 0) & (p > 0) & dr.isfinite(p) & dr.isfinite(q)
+        ratio = dr.select(attached, q, 0) / dr.select(attached, p, 1) * dr.select(attached, spread, 1)
+        return dr.select(attached, dr.replace_grad(weight, dr.rcp(1 + dr.square(ratio))), weight)
+
+
 class Scattering:
     """Direct illumination by multiple importance sampling, and the next vertex of a path.
 
@@ -40,7 +71,9 @@ class Scattering:
         f(ω) |cos θ_x| Lₑ(y, −ω) · |cos θ_y| dA / r²  /  p(ω),      ω = (y − x) / r,
 
     where all factors but the density p follow the motion of x and y, dA by the change of the area of the triangle. The
-    same holds for every next vertex of a path (Zhang et al. 2020). So what moves together sees no motion at all.
+    same holds for every next vertex of a path (Zhang et al. 2020). So what moves together sees no motion at all. The
+    weights of multiple importance sampling have no derivative, but in the light of `SmoothLamps`, where they do not
+    cancel.
 
     attached : carry gradients? Otherwise values only.
     """
@@ -61,6 +94,7 @@ class Scattering:
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
         self.any_null = any(f & mi.BSDFFlags.Null for f in bsdfs)
+        self.smooth_lamps = SmoothLamps(scene)
         self.by_density = [mi.BSDFPtr(s.bsdf()) for s in scene.shapes() if s.bsdf() and divides_by_density(s.bsdf())]
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
@@ -88,17 +122,19 @@ class Scattering:
         with dr.resume_grad(when=self.attached and not self.any_hit_by_rays):
             ds, weight = towards_light(active)
         active &= ds.pdf != 0
-        direction, still = ds.d, mi.Bool(False)
+        direction, to_lamp = ds.d, None
         if self.attached and self.any_hit_by_rays:
-            direction, weight, visible, still = self._attach_emitter(si, ds, weight, towards_light, active)
+            direction, weight, visible, to_lamp = self._attach_emitter(si, ds, weight, towards_light, active)
             active &= visible
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
-            mis = dr.select(
-                ds.delta | self._found_by_light_samples(ds), 1, mis_weight(dr.detach(ds.pdf), dr.detach(pdf))
-            )
+            mis = mis_weight(ds.pdf, pdf)
+            if len(self.smooth_lamps) and to_lamp is not None:
+                mis = to_lamp.attach(mis, ds.pdf, pdf, to_lamp.spread)
+            mis = dr.select(ds.delta | self._found_by_light_samples(ds), 1, mis)
             L = dr.select(active, f * weight * mis, 0)
-            L = dr.select(still, dr.detach(L), L)
+            if to_lamp is not None:
+                L = dr.select(to_lamp.still, dr.detach(L), L)
         if not self.attached:
             active &= dr.any(L != 0)
         elif not self.any_hit_by_rays:
@@ -111,7 +147,7 @@ class Scattering:
 
     def _attach_emitter(self, si, ds, weight, towards_light, active):
         """Direction and weight (Lₑ · geometry / density) of a light sample with their gradients, its visibility, and
-        whether it is taken to stand still, see `_connect`."""
+        what joins it to `si`."""
         scene = self.scene
         on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
         # One ray answers both questions: is the light visible, and which of its triangles is y on?
@@ -121,10 +157,11 @@ class Scattering:
         pi = scene.ray_intersect_preliminary(ray, active=active)
         visible = dr.select(on_surface, pi.is_valid() & (pi.t >= before), ~pi.is_valid())
         with dr.resume_grad():
-            y, ω, geometry, still = self._connect(si, pi, ray, on_surface & visible)
-            direction = dr.select(on_surface, ω, ds.d)
+            to_lamp = self._connect(si, pi, ray, on_surface & visible, by_light=True)
+            y = to_lamp.y
+            direction = dr.select(on_surface, to_lamp.ω, ds.d)
             # Lights at infinity: the direction is fixed.
-            attached = y.emitter(scene).eval(y, on_surface & visible) * (geometry / ds.pdf)
+            attached = y.emitter(scene).eval(y, on_surface & visible) * (to_lamp.geometry / ds.pdf)
             if self.any_elsewhere:
                 # By `eval`: the `eval_direction` of `envmap` does not notice that the environment turns (Mitsuba 3.9).
                 seen = dr.zeros(mi.SurfaceInteraction3f, dr.width(ds.d))
@@ -137,7 +174,7 @@ class Scattering:
                 moved, at_moved = towards_light(active & follows)
                 direction = dr.select(follows, moved.d, direction)
                 attached = dr.select(follows, at_moved, attached)
-            return direction, dr.replace_grad(weight, attached), visible, still
+            return direction, dr.replace_grad(weight, attached), visible, to_lamp
 
     def sample_bsdf(self, si, bsdf, sampler, active):
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
@@ -154,11 +191,12 @@ class Scattering:
         else:
             with dr.resume_grad():
                 on_surface = active & pi.is_valid()
-                y, ω, geometry, still = self._connect(si, pi, ray, on_surface)
-                ω = dr.select(on_surface, ω, ray.d)
+                to_y = self._connect(si, pi, ray, on_surface, by_light=False)
+                y = to_y.y
+                ω = dr.select(on_surface, to_y.ω, ray.d)
                 f = bsdf.eval(context, si, si.to_local(ω), active & ~mirrored)
-                attached = f * (dr.select(on_surface, geometry, 1) / bs.pdf)
-                attached = dr.select(still, dr.detach(attached), attached)
+                attached = f * (dr.select(on_surface, to_y.geometry, 1) / bs.pdf)
+                attached = dr.select(to_y.still, dr.detach(attached), attached)
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
                     turned, at_mirror = bsdf.sample(context, si, sample1, sample2, active & mirrored)
@@ -179,8 +217,12 @@ class Scattering:
         emitter = y.emitter(scene, active)
         ds = mi.DirectionSample3f(scene, y, si)
         pdf = self.pdf_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
-        mis = dr.select(mirrored, 1, mis_weight(bs.pdf, pdf))
         with dr.resume_grad(when=self.attached):
+            mis = mis_weight(bs.pdf, pdf)
+            if len(self.smooth_lamps) and self.attached:
+                bsdf_pdf = bsdf.pdf(context, si, si.to_local(ω), active & ~mirrored)
+                mis = to_y.attach(mis, bsdf_pdf, pdf, dr.rcp(to_y.spread))
+            mis = dr.select(mirrored, 1, mis)
             Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
         return Le, Next(ray, pi, weight, bs.eta, through)
 
@@ -225,24 +267,28 @@ class Scattering:
             L = dr.select(mine, several.eval_background(y, mine), L)
         return L
 
-    def _connect(self, si, pi, ray, active):
-        """The material point y that `pi` stands for, the direction ω from `si` to it, |cos θ_y| dA / r² relative to its
-        present value, and where all of this is taken to stand still, since rounding would make its derivative."""
+    def _connect(self, si, pi, ray, active, *, by_light: bool) -> Connection:
+        """What joins `si` to the material point that `pi` stands for, found by a sample of a light or of the BSDF."""
         y = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
         d = y.p - si.p
         r2 = dr.squared_norm(d)
         ω = d * dr.rsqrt(r2)
         # A ray that meets nothing keeps its direction.
         y.wi = dr.select(active, dr.replace_grad(y.wi, y.to_local(-ω)), y.wi)
-        geometry = dr.abs_dot(y.n, ω) / r2
+        cos, smooth, spread = dr.abs_dot(y.n, ω), mi.Bool(False), mi.Float(1)
+        if len(self.smooth_lamps):
+            smooth, shading_cos = self.smooth_lamps.are(pi.shape), dr.abs_dot(y.sh_frame.n, ω)
+            spread = _relative(shading_cos / r2)  # 0 only where nothing is emitted
+            if by_light:
+                cos = dr.select(smooth, shading_cos, cos)
+        geometry = cos / r2
         if self.moving:
             geometry *= self._area(pi, ray, active)
-        now = dr.detach(geometry)
-        relative = dr.select(now > 0, geometry / dr.select(now > 0, now, 1), 0)
+        geometry = _relative(geometry)
         still = active & flush(si, y)
         fixed = still | grazes(y, ω, active) if self.any_curved else still
-        y = dr.select(still, dr.detach(y), y)
-        return y, dr.select(still, dr.detach(ω), ω), dr.select(fixed, dr.detach(relative), relative), still
+        y, ω = dr.select(still, dr.detach(y), y), dr.select(still, dr.detach(ω), ω)
+        return Connection(y, ω, dr.select(fixed, dr.detach(geometry), geometry), still, smooth & ~still, spread)
 
     def _area(self, pi, ray, active):
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
@@ -263,6 +309,12 @@ class Scattering:
             return area
         si = pi.compute_surface_interaction(ray, mi.RayFlags.dPdUV | mi.RayFlags.FollowShape, on_other)
         return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
+
+
+def _relative(x: mi.Float) -> mi.Float:
+    """A number over its present value; 0 where that is 0."""
+    now = dr.detach(x)
+    return dr.select(now > 0, x / dr.select(now > 0, now, 1), 0)
 
 
 #: Cosine below which a surface that is no mesh is taken to stand still. Where a fixed ray meets a curved one, and the

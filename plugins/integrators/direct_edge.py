@@ -48,7 +48,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     lines in which meshes cut through each other, or the far clipping plane through them, the borders of hard beams,
     and shadows of hair, instances, ... on what moves. Warned about, too: jumps at T-junctions, which count twice,
     and participating media, which are taken for empty (derivatives with respect to their parameters are refused).
-    So is the light of smooth-shaded lamps with coarse meshes, of which a fringe is missing.
+    So is the light of smooth-shaded lamps with coarse meshes, which is off by some per cent.
     Polarised variants are refused. With filters other than ``box``, the ratio of sums that makes a pixel has a bias
     of order 1/spp, as it has in the image.
 
