@@ -68,17 +68,34 @@ class DeviceEdges:
         p : a point of the edge that the rays pass, world space.
         """
         a, b = self.end_points(positions, edge)
-        # Half-way between the rays is the line of sight itself: faces may be closer to it than the rays are.
-        line_of_sight = p - dr.lerp(rays[0].o, rays[1].o, 0.5)
-        fold = dr.gather(mi.Bool, self._two_faces, edge)
-        across = dr.cross(b - a, line_of_sight)
-        opposite = self.opposite(positions, edge)
-        fold &= dr.sign(dr.dot(opposite[0] - p, across)) != dr.sign(dr.dot(opposite[1] - p, across))
         passed = [mi.Bool(False), mi.Bool(False)]
-        for o in opposite:
+        for o in self.opposite(positions, edge):
             for k, ray in enumerate(rays):
                 passed[k] |= passes(ray, [a, b, o])
-        return fold & ~(passed[0] & passed[1])
+        return self.is_fold(positions, edge, p, line_of_sight(p, rays)) & ~(passed[0] & passed[1])
+
+    def is_fold(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, sight: mi.Vector3f) -> mi.Bool:
+        """Do edges have faces on both sides, as seen along a line of sight through a point p of theirs?"""
+        a, b = self.end_points(positions, edge)
+        across = dr.cross(b - a, sight)
+        sides = [dr.sign(dr.dot(o - p, across)) for o in self.opposite(positions, edge)]
+        return dr.gather(mi.Bool, self._two_faces, edge) & (sides[0] != sides[1])
+
+    def facing(
+        self, normals: mi.Float, sign: mi.Float, edge: mi.UInt32, t: mi.Float, to_viewer: mi.Vector3f
+    ) -> mi.Float:
+        """Do the interpolated normals at points of edges face the viewer? +1: yes; −1: no; 0: there are none, or the
+        two sides do not agree.
+
+        normals : (3 V,). sign : (V,), their sign in Mitsuba, 0 where there are none. t : from the first end point to
+        the second.
+        """
+        found = []
+        for side in (0, 1):
+            a, b = self._points_of_side(normals, edge, side)
+            s = dr.gather(mi.Float, sign, dr.gather(mi.UInt32, self._ends[side][0], edge))
+            found.append(dr.select(s == 0, 0, dr.sign(s * dr.dot(dr.lerp(a, b, t), to_viewer))))
+        return dr.select(found[0] == found[1], found[0], 0)
 
     def is_silhouette_of_any(self, positions: mi.Float, edge: mi.UInt32, places: mi.Vector4f) -> mi.Bool:
         """Is the edge a silhouette as seen from one of the `places`, see `Lights.places`? Detached."""
@@ -136,6 +153,11 @@ class DeviceEdges:
         if geometry is not None and EdgeKind.SPLIT in self._kinds:
             boundary |= (kind == int(EdgeKind.SPLIT)) & (self.normals_differ(geometry.normals(), edge) > COPLANAR)
         return boundary
+
+
+def line_of_sight(p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]) -> mi.Vector3f:
+    """To a point p, half-way between the rays that pass it: faces may be closer to it than these are."""
+    return p - dr.lerp(rays[0].o, rays[1].o, 0.5)
 
 
 def passes(ray: mi.Ray3f, corners: list[mi.Point3f]) -> mi.Bool:

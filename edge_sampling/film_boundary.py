@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from .curves import Curves
-from .device_edges import DeviceEdges
+from .device_edges import DeviceEdges, line_of_sight
 from .edges import Edges
 from .horizon import Horizon, HorizonPoint, Horizons
 from .lights import Lights
@@ -231,13 +231,10 @@ class FilmBoundary:
                 rays.append(ray)
                 weights.append(weight)
             if self.edges is not None:
-                active &= ~(is_edge & self.edges.is_hidden_fold(positions, dr.select(is_edge, index, 0), p, rays))
+                edge = dr.select(is_edge, index, 0)
+                active &= ~(is_edge & self.edges.is_hidden_fold(positions, edge, p, rays))
             if self.horizons is not None:
-                # Beside a silhouette that is closer than the rays look, the silhouette has this jump already: the ray
-                # on the dark side must still see a surface that is dark.
-                on_dark_side = active & is_horizon & ~self.horizons.passed(positions, face, rays[0])
-                si = scene.ray_intersect(rays[0], mi.RayFlags.All, True, on_dark_side)
-                active &= ~on_dark_side | (si.is_valid() & (dr.dot(si.sh_frame.n, rays[0].d) > 0))
+                active &= ~is_horizon | self.horizons.sees_dark_side(scene, face, p, rays[0], active & is_horizon)
             if self.curves is not None:
                 # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
                 # that: a jump of the contour's, which would count twice.
@@ -246,7 +243,13 @@ class FilmBoundary:
                 active &= ~is_curve | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
             horizons = [None, None]
             if self.horizons is not None:
-                horizons = [Horizon(dr.select(is_horizon, mi.Float(sign), 0), p) for sign in (-1, 1)]
+                side = mi.Float(0)
+                if self.edges is not None:
+                    # Where a curve runs between the two rays beside an edge, its jump is not that of the edge.
+                    sight = line_of_sight(p, rays)
+                    side = self.edges.facing(normals, self.horizons.sign, edge, t, -sight)
+                    side = dr.select(is_edge & self.edges.is_fold(positions, edge, p, sight), side, 0)
+                horizons = [Horizon(dr.select(is_horizon, mi.Float(sign), side), p, is_horizon) for sign in (-1, 1)]
             n_dl = dr.select(active, n_dl, 0)
             return BoundaryPoints(u, n_dl, velocity, rays, weights, active, horizons, projection.attached)
 

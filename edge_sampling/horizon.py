@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .device_edges import passes
+from .device_edges import rounding
 from .meshes import Geometry, has_interpolated_normals
 
 
@@ -33,12 +33,15 @@ from .meshes import Geometry, has_interpolated_normals
 class Horizon:
     """On which side of such a curve the first vertex of a path is.
 
-    side : mi.Float, (N,); +1: its normal just faces the viewer; −1: it just faces away; 0: it is as it is.
-    p : mi.Point3f, (N,), the point of the curve, world space: what hides it is none of its sides.
+    side : mi.Float, (N,); +1: its normal faces the viewer; −1: it faces away; 0: it is as it is.
+    p : mi.Point3f, (N,), a point of the curve, or of an edge that such a curve may be close to, world space: what hides
+        it is none of its sides.
+    on_curve : mi.Bool, (N,), is it one of the curve? Then the normal *just* faces the viewer, or faces away.
     """
 
     side: mi.Float
     p: mi.Point3f
+    on_curve: mi.Bool
 
 
 @dataclass
@@ -66,18 +69,20 @@ class Horizons:
     moving : which of its meshes can move over the film.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("count", "_corners", "_sign"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("count", "_corners", "sign", "_number"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, moving: np.ndarray):
         self.geometry = geometry
         smooth = [bool(m) and has_interpolated_normals(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
         faces = geometry.faces(tuple(smooth))
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
-        signs = [
-            np.full(m.face_count(), _sign(m), np.float32) for m, s in zip(geometry.meshes, smooth, strict=True) if s
-        ]
-        # Not in NumPy's memory, for frozen functions.
-        self._sign = mi.Float(np.concatenate(signs)) * dr.opaque(mi.Float, 1) if signs else None
+        meshes = [m for m, s in zip(geometry.meshes, smooth, strict=True) if s]
+        signs = [np.full(m.vertex_count(), _sign(m) if m in meshes else 0, np.float32) for m in geometry.meshes]
+        numbers = [np.arange(m.face_count(), dtype=np.uint32) for m in meshes]
+        #: (V,), of each vertex of the geometry: -1 if Mitsuba turns its normal round, 0 where it is not interpolated.
+        self.sign = mi.Float(np.concatenate(signs)) * dr.opaque(mi.Float, 1) if meshes else None
+        # (Not in NumPy's memory, for frozen functions.)
+        self._number = mi.UInt32(np.concatenate(numbers)) + dr.opaque(mi.UInt32, 0) if meshes else None
         #: Number of faces.
         self.count = len(faces)
 
@@ -87,7 +92,7 @@ class Horizons:
     def _face(self, positions: mi.Float, normals: mi.Float, face: mi.UInt32) -> tuple[list, list]:
         """Corners of faces, and the normals there, not normalised, as Mitsuba has them."""
         corners = [dr.gather(mi.UInt32, c, face) for c in self._corners]
-        sign = dr.gather(mi.Float, self._sign, face)
+        sign = dr.gather(mi.Float, self.sign, corners[0])
         p = [dr.gather(mi.Point3f, positions, c) for c in corners]
         return p, [sign * dr.gather(mi.Vector3f, normals, c) for c in corners]
 
@@ -147,9 +152,14 @@ class Horizons:
         follows = t - dr.select(valid, (now - dr.detach(now)) / dr.select(valid, dr.detach(g_t), 1), 0)
         return HorizonPoint(mi.Point3f(p[0] + follows * D), dr.detach(tangent), dr.detach(facing), valid)
 
-    def passed(self, positions: mi.Float, face: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
-        """Do rays pass through faces? Detached."""
-        return passes(ray, [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, c, face)) for c in self._corners])
+    def sees_dark_side(self, scene: mi.Scene, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, active) -> mi.Bool:
+        """Do rays that pass points of curves on their dark side see the faces in which these are, or at least a surface
+        that is dark? Not so beside a silhouette that is closer than the rays look, which has this jump already; nor
+        where something hides the face, be it the next one of the same mesh. Detached."""
+        si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
+        there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o)
+        its_face = there & (si.prim_index == dr.gather(mi.UInt32, self._number, face))
+        return si.is_valid() & (its_face | (dr.dot(si.sh_frame.n, ray.d) > 0))
 
 
 def _towards(p: mi.Point3f, n: mi.Vector3f, eye: mi.Point3f, far: bool) -> mi.Float:

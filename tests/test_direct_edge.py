@@ -259,25 +259,11 @@ def test_polarised_variants_are_refused():
 
 
 def warnings_of(scene, key, options, **motion) -> str:
-    messages = []
-
-    class Collect(mi.Appender):
-        def append(self, level, text):
-            messages.append(text)
-
-        def log_progress(self, *args):
-            pass
-
-    appender = Collect()
-    logger = mi.logger()
-    logger.add_appender(appender)
-    try:
+    with cases.messages() as found:
         it = integrator(**options)
         for _ in range(2):
             derivative_image(scene, it, Motion(scene, key, **motion), spp=1)
-    finally:
-        logger.remove_appender(appender)
-    return "\n".join(m for m in messages if "_edge: " in m)
+    return "\n".join(m for m in found if "_edge: " in m)
 
 
 def test_limits_are_warned_about_once():

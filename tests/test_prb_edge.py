@@ -220,25 +220,12 @@ def test_unknown_parameters_are_refused():
 
 
 def test_mirrors_are_warned_about_once():
-    messages = []
-
-    class Collect(mi.Appender):
-        def append(self, level, text):
-            messages.append(text)
-
-        def log_progress(self, *args):
-            pass
-
     scene = cases.room(lambda: cases.camera(film=small()), bsdf=lambda: {"type": "conductor"})()
     motion, it = Motion(scene, **SIDE), integrator(sppc=0, sppp=0)
-    appender = Collect()
-    mi.logger().add_appender(appender)
-    try:
+    with cases.messages() as found:
         for _ in range(2):
             derivative_image(scene, it, motion, spp=1)
-    finally:
-        mi.logger().remove_appender(appender)
-    assert sum("prb_edge: the derivative lacks" in m and "perfect mirrors" in m for m in messages) == 1
+    assert sum("prb_edge: the derivative lacks" in m and "perfect mirrors" in m for m in found) == 1
 
 
 # ---------------------- Other variants ----------------------

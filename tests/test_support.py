@@ -664,24 +664,10 @@ def test_dictionary_of_lobes(key, step, motion):
 # ---------------------- Warnings and refusals ----------------------
 
 
-class Log(mi.Appender):
-    def __init__(self):
-        super().__init__()
-        self.text = ""
-
-    def append(self, level, text):
-        self.text += text
-
-    def log_progress(self, *args):
-        pass
-
-
 @pytest.fixture
 def log():
-    appender = Log()
-    mi.logger().add_appender(appender)
-    yield appender
-    mi.logger().remove_appender(appender)
+    with cases.messages() as found:
+        yield found
 
 
 SILHOUETTES, SENSOR = REFUSALS = ("silhouettes cannot be sampled", "is not supported, use one of")
@@ -848,7 +834,7 @@ def test_warned_or_refused(message, column, log, tmp_path):
     else:
         enable(scene, key)
         message.integrator().find_boundaries(scene, sensor)
-        assert log.text.count(message.text) == 1
+        assert "".join(log).count(message.text) == 1
 
 
 @pytest.mark.parametrize("row", CHANGES)
@@ -858,7 +844,7 @@ def test_parameters_that_are_warned_about(row, log, tmp_path):
         scene = message.scene(tmp_path)
         enable(scene, key)
         message.integrator().find_boundaries(scene)
-        assert f'{message.text} "{key}"' in log.text
+        assert f'{message.text} "{key}"' in "".join(log)
 
 
 def is_checked(row: str, column: str, text: str) -> bool:

@@ -359,12 +359,12 @@ def met_by(
 def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -> None:
     """Turn interpolated normals that lie on the horizon of the viewer, but for rounding, to a side of it.
 
-    Does nothing to what hides the point of the horizon.
+    Does nothing to what hides the point of the horizon, nor, beside edges, to normals that face the right side.
     """
     to_viewer = -ray.d
     cos = dr.dot(si.sh_frame.n, to_viewer)
     there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o)
-    turn = there & si.is_valid() & (horizon.side != 0)
+    turn = there & si.is_valid() & (horizon.side != 0) & (horizon.on_curve | (horizon.side * cos <= 0))
     n = dr.normalize(si.sh_frame.n + (horizon.side * BESIDE_HORIZON - cos) * to_viewer)
     si.sh_frame.n = dr.select(turn, n, si.sh_frame.n)
     si.initialize_sh_frame()

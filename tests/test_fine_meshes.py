@@ -1,0 +1,53 @@
+"""Meshes so fine that jumps lie closer to each other on the film than the rays look beside them. Each counts once."""
+
+from __future__ import annotations
+
+import cases
+import mitsuba as mi
+import numpy as np
+import pytest
+from random_scenes import ball
+
+from rimlight.edge_sampling import Motion, derivative_image, finite_differences
+
+
+def bumps() -> dict:
+    """A material that depends on the tangents of each face: every edge jumps."""
+    slopes = np.random.default_rng(1).uniform(0.4, 0.6, (8, 8, 3))
+    slopes[..., 2] = 0.9
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(slopes.astype(np.float32)), "raw": True}
+    return {"type": "normalmap", "normalmap": picture, "bsdf": cases.diffuse(0)}
+
+
+def glowing_ball(rings: int, kind: str, bsdf: dict) -> mi.Scene:
+    points, _, uv, faces = ball(rings)
+    turned = np.array(mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 37).matrix)[:3, :3]
+    p = 0.45 * points @ turned.T + [0.1, 0.05, 0]
+    lamp = cases.mesh("lamp", p, faces, normals=True, uv=uv, bsdf=bsdf, emitter=cases.light(1, 1, 1))
+    lens = {"aperture_radius": 0.1, "focus_distance": 5.4} if kind == "thinlens" else {}
+    lens |= {} if kind == "orthographic" else {"fov": 16}
+    film = cases.film(width=16, height=16, pixel_format="luminance")
+    return cases.scene(sensor=cases.camera((0, 2, -5), kind=kind, film=film, **lens), lamp=lamp)
+
+
+@pytest.mark.parametrize(
+    ("rings", "kind", "bumpy"),
+    [
+        (140, "perspective", False),
+        (70, "thinlens", False),
+        (70, "orthographic", True),
+    ],
+)
+def test_outlines_count_once(rings, kind, bumpy):
+    """The horizon of the normals is 10⁻⁴ of the ball from its outline, often less than the rays look aside."""
+    scene = glowing_ball(rings, kind, bumps() if bumpy else cases.diffuse(0))
+    motion = Motion(scene, "lamp.vertex_positions", direction=[1, 0.3, 0.2])
+    path = mi.load_dict({"type": "path", "max_depth": 2})
+    reference = finite_differences(scene, motion, step=2e-3, runs=8, spp=4096, integrator=path)
+    integrator = mi.load_dict({"type": "direct_edge"})
+    images = [np.array(derivative_image(scene, integrator, motion, spp=256, seed=i)) for i in range(8)]
+    scales = [(image * reference.mean).sum() / (reference.mean**2).sum() for image in images]
+    error = np.std(scales, ddof=1) / np.sqrt(len(scales))
+    noise = np.sqrt((reference.standard_error**2 * reference.mean**2).sum()) / (reference.mean**2).sum()
+    print(f"{np.mean(scales):.4f} ± {error:.4f} ± {noise:.4f}")
+    assert abs(np.mean(scales) - 1) <= 0.01 + 3 * np.hypot(error, noise)
