@@ -77,7 +77,10 @@ class Horizons:
         faces = geometry.faces(tuple(smooth))
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
         meshes = [m for m, s in zip(geometry.meshes, smooth, strict=True) if s]
-        signs = [np.full(m.vertex_count(), _sign(m) if m in meshes else 0, np.float32) for m in geometry.meshes]
+        signs = [
+            np.full(m.vertex_count(), (-1 if m.has_flipped_normals() else 1) if s else 0, np.float32)
+            for m, s in zip(geometry.meshes, smooth, strict=True)
+        ]
         numbers = [np.arange(m.face_count(), dtype=np.uint32) for m in meshes]
         #: (V,), of each vertex of the geometry: -1 if Mitsuba turns its normal round, 0 where it is not interpolated.
         self.sign = mi.Float(np.concatenate(signs)) * dr.opaque(mi.Float, 1) if meshes else None
@@ -209,16 +212,3 @@ def _roots(p, n, D, N, eye, far: bool) -> tuple[mi.Float, mi.Float]:
     A, B, C = -dr.dot(N, D), dr.dot(N, view) - dr.dot(n, D), dr.dot(n, view)
     q = -0.5 * (B + dr.mulsign(dr.sqrt(B * B - 4 * A * C), B))
     return C / q, q / A
-
-
-def _sign(mesh: mi.Mesh) -> float:
-    """-1 if Mitsuba turns the normals of a mesh round ("flip_normals")."""
-    with dr.suspend_grad():
-        pi = dr.zeros(mi.PreliminaryIntersection3f)
-        pi.t, pi.prim_uv, pi.prim_index, pi.shape = mi.Float(1), mi.Point2f(1 / 3), mi.UInt32(0), mi.ShapePtr(mesh)
-        si = pi.compute_surface_interaction(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)), mi.RayFlags.All, True)
-        faces, normals = (
-            np.array(mesh.faces_buffer())[:3],
-            np.array(dr.detach(mesh.vertex_normals_buffer())).reshape(-1, 3),
-        )
-        return -1.0 if float(np.array(si.sh_frame.n).ravel() @ normals[faces].sum(0)) < 0 else 1.0

@@ -118,11 +118,11 @@ def light(*radiance: float) -> dict:
     return {"type": "area", "radiance": {"type": "rgb", "value": list(radiance)}}
 
 
-def mesh(name: str, vertices, faces, normals: bool = False, uv=None, colours=None, **props: dict) -> mi.Mesh:
+def mesh(name: str, vertices, faces, normals: bool = False, uv=None, colours=None, **props: Any) -> mi.Mesh:
     """A mesh from lists; flat-shaded unless `normals`. `uv` and `colours` (`vertex_color`) are given by vertex."""
     p = mi.Properties()
     for key, value in props.items():
-        p[key] = mi.load_dict(value)
+        p[key] = mi.load_dict(value) if isinstance(value, dict) else value
     has_uv = uv is not None
     m = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=has_uv, props=p)
     if colours is not None:
