@@ -1,7 +1,7 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
 from .batch import Batch, FilmPart, film_parts
-from .edge_importance import Cone, EdgeSample, Lobe, View, power_heuristic, resample, sample_edge, stratified
+from .edge_importance import Cone, EdgeSample, Lobe, View, resample, sample_edge, stratified
 from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .film_boundary import BoundarySamples, FilmBoundary
@@ -55,7 +55,6 @@ __all__ = [
     "jumping_textures",
     "mean_and_error",
     "objects_below",
-    "power_heuristic",
     "resample",
     "sample_edge",
     "stratified",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cases
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -50,6 +51,23 @@ def test_outlines_count_once(rings, kind, bumpy):
 def test_flipped_normals():
     """Of a coarse ball, whose horizon is well inside of its outline."""
     compare(glowing_ball(6, "perspective", cases.diffuse(0), flipped=True))
+
+
+@pytest.mark.parametrize("kind", ["direct_edge", "prb_edge"])
+def test_light_of_coarse_lamps_backward(kind):
+    """As forward: the weights of importance sampling carry the gradient both ways."""
+    scene, integrator = cases.coarse_lamp(), mi.load_dict({"type": kind})
+    motion = Motion(scene, **cases.LIGHT_SIDE)
+    forward = np.array(derivative_image(scene, integrator, motion, spp=16, seed=1), np.float64).sum()
+    params, key = mi.traverse(scene), cases.LIGHT_SIDE["key"]
+    dr.enable_grad(params[key])
+    params.update()
+    ones = dr.full(mi.TensorXf, 1, (cases.RES, cases.RES, 3))
+    integrator.render_backward(scene, params, ones, seed=1, spp=16)
+    gradient = np.array(dr.grad(params[key]), np.float64).reshape(-1, 3)
+    backward = (gradient * cases.LIGHT_SIDE["direction"]).sum()
+    assert np.isfinite(gradient).all()
+    assert backward == pytest.approx(forward, rel=2e-3)
 
 
 def compare(scene: mi.Scene) -> None:

@@ -51,14 +51,14 @@ class Connection:
     smooth: mi.Bool
     spread: mi.Float
 
-    def attach(self, weight: mi.Float, p: mi.Float, q: mi.Float, spread: mi.Float) -> mi.Float:
+    def attach(self, weight: mi.Float, p: mi.Float, q: mi.Float, *, by_light: bool) -> mi.Float:
         """Attach a weight of multiple importance sampling where y is on one of the `SmoothLamps`.
 
-        p, q : the densities of which it is made.
-        spread : what q / p is proportional to, if `p` and `q` know no more of it.
+        p, q : the densities of which it is made, that of light samples detached. by_light : is that p, or q?
         """
         attached = self.smooth & (self.spread > 0) & (p > 0) & dr.isfinite(p) & dr.isfinite(q)
-        ratio = dr.select(attached, q, 0) / dr.select(attached, p, 1) * dr.select(attached, spread, 1)
+        spread = dr.select(attached, self.spread, 1)
+        ratio = dr.select(attached, q, 0) / dr.select(attached, p, 1) * (spread if by_light else dr.rcp(spread))
         return dr.select(attached, dr.replace_grad(weight, dr.rcp(1 + dr.square(ratio))), weight)
 
 
@@ -130,7 +130,7 @@ class Scattering:
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
             mis = mis_weight(ds.pdf, pdf)
             if len(self.smooth_lamps) and to_lamp is not None:
-                mis = to_lamp.attach(mis, ds.pdf, pdf, to_lamp.spread)
+                mis = to_lamp.attach(mis, ds.pdf, pdf, by_light=True)
             mis = dr.select(ds.delta | self._found_by_light_samples(ds), 1, mis)
             L = dr.select(active, f * weight * mis, 0)
             if to_lamp is not None:
@@ -221,7 +221,7 @@ class Scattering:
             mis = mis_weight(bs.pdf, pdf)
             if len(self.smooth_lamps) and self.attached:
                 bsdf_pdf = bsdf.pdf(context, si, si.to_local(ω), active & ~mirrored)
-                mis = to_y.attach(mis, bsdf_pdf, pdf, dr.rcp(to_y.spread))
+                mis = to_y.attach(mis, bsdf_pdf, pdf, by_light=False)
             mis = dr.select(mirrored, 1, mis)
             Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
         return Le, Next(ray, pi, weight, bs.eta, through)
