@@ -58,7 +58,13 @@ class DeviceEdges:
         return [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, o, edge)) for o in self._opposite]
 
     def is_hidden_fold(
-        self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]
+        self,
+        positions: mi.Float,
+        edge: mi.UInt32,
+        p: mi.Point3f,
+        rays: tuple[mi.Ray3f, mi.Ray3f],
+        scene: mi.Scene | None = None,
+        active: mi.Bool = True,
     ) -> mi.Bool:
         """Do two rays, close by on both sides of an edge that is no silhouette, miss its faces?
 
@@ -66,13 +72,18 @@ class DeviceEdges:
         a jump that is theirs, and would count twice.
 
         p : a point of the edge that the rays pass, world space.
+        scene : where given, rays miss faces that something else hides, too: on fine meshes, that may end between them.
         """
         a, b = self.end_points(positions, edge)
+        fold = self.is_fold(positions, edge, p, line_of_sight(p, rays))
+        met = [None if scene is None else r(scene.ray_intersect_preliminary(r, active & fold).t) for r in rays]
         passed = [mi.Bool(False), mi.Bool(False)]
         for o in self.opposite(positions, edge):
-            for k, ray in enumerate(rays):
-                passed[k] |= passes(ray, [a, b, o])
-        return self.is_fold(positions, edge, p, line_of_sight(p, rays)) & ~(passed[0] & passed[1])
+            n = dr.normalize(dr.cross(b - a, o - a))
+            for k, (ray, q) in enumerate(zip(rays, met, strict=True)):
+                there = True if q is None else dr.abs_dot(n, q - p) <= rounding(p, ray.o)
+                passed[k] |= passes(ray, [a, b, o]) & there
+        return fold & ~(passed[0] & passed[1])
 
     def is_fold(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, sight: mi.Vector3f) -> mi.Bool:
         """Do edges have faces on both sides, as seen along a line of sight through a point p of theirs?"""

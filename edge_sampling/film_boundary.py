@@ -88,7 +88,7 @@ class FilmBoundary:
     """
 
     DRJIT_STRUCT = dict.fromkeys(
-        ("edges", "corners", "horizons", "curves", "counts", "lights", "transmits")
+        ("edges", "corners", "horizons", "curves", "counts", "lights", "transmit")
     )  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights):
@@ -105,11 +105,20 @@ class FilmBoundary:
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
         cuts = len(faces) if len(edges) else 0
         self.counts = (len(edges), cuts, len(horizons), len(self.curves) if shapes else 0)
-        bsdfs = [m.bsdf() for m, moves in zip(geometry.meshes, moving, strict=False) if moves]
-        #: Does light go through a mesh? Not where there are horizons, which may be closer to a silhouette.
-        self.transmits = self.horizons is None and any(
-            b is not None and b.flags() & mi.BSDFFlags.Transmission for b in bsdfs
-        )
+        self.transmit = self._transmitting(edges, faces)
+
+    def _transmitting(self, edges: Edges, faces: np.ndarray) -> mi.Bool | None:
+        """Which edges, cuts, horizons and pieces of curves, in this order, are on a mesh that light goes through? None
+        if it goes through none of the meshes."""
+        meshes = self.geometry.meshes
+        transmits = [m.bsdf() is not None and bool(m.bsdf().flags() & mi.BSDFFlags.Transmission) for m in meshes]
+        if not any(transmits):
+            return None
+        vertex = np.repeat(transmits, [m.vertex_count() for m in meshes])
+        first = [edges.vertices[:, 0, 0], faces[:, 0] if len(edges) else []]
+        first.append(self.horizons.faces[:, 0] if self.horizons is not None else [])
+        parts = [vertex[np.asarray(v, np.int64)] for v in first]
+        return mi.Bool(np.concatenate([*parts, np.zeros(self.counts[3], bool)]))
 
     def sample(
         self,
@@ -213,7 +222,7 @@ class FilmBoundary:
                 n_dl = dr.select(is_horizon, dr.mulsign(n_dl, dr.dot(n_dl, facing)), n_dl)
             n = dr.normalize(n_dl)
             u, p = dr.detach(u), dr.detach(p)
-            offset = self._offset(projection, p) * n
+            offset = self._offset(projection, p, index) * n
             active = valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             time = sensor.shutter_open()
             if sensor.shutter_open_time() > 0:
@@ -232,7 +241,9 @@ class FilmBoundary:
                 weights.append(weight)
             if self.edges is not None:
                 edge = dr.select(is_edge, index, 0)
-                active &= ~(is_edge & self.edges.is_hidden_fold(positions, edge, p, rays))
+                # (Beside horizons, of which what hides an edge may have one, more than its shape matters.)
+                hides = (scene, active & is_edge) if self.horizons is not None else ()
+                active &= ~(is_edge & self.edges.is_hidden_fold(positions, edge, p, rays, *hides))
             if self.horizons is not None:
                 active &= ~is_horizon | self.horizons.sees_dark_side(scene, face, p, rays[0], active & is_horizon)
             if self.curves is not None:
@@ -368,14 +379,15 @@ class FilmBoundary:
             points.append(dr.select(crossed, dr.lerp(corners[0], corners[k], t), dr.nan))
         return points[0], points[1]
 
-    def _offset(self, projection: Projection, p: mi.Point3f) -> mi.Float:
+    def _offset(self, projection: Projection, p: mi.Point3f, index: mi.UInt32) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart."""
         ulp = dr.epsilon(mi.Float) * 2
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = 8 * ulp * largest
-        if self.transmits:
+        if self.transmit is not None:
             # Mitsuba's rays start so far from a surface: beside the edge of glass, beyond the face on the other side.
-            in_world += BEHIND * mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+            behind = BEHIND * mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+            in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind, 0)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film

@@ -74,7 +74,8 @@ class Horizons:
     def __init__(self, geometry: Geometry, moving: np.ndarray):
         self.geometry = geometry
         smooth = [bool(m) and has_interpolated_normals(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
-        faces = geometry.faces(tuple(smooth))
+        #: (F, 3), their vertices.
+        self.faces = faces = geometry.faces(tuple(smooth))
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
         meshes = [m for m, s in zip(geometry.meshes, smooth, strict=True) if s]
         signs = [

@@ -215,11 +215,13 @@ class PlanarProjection(Projection):
         return scale * self.lens_radius() * dr.abs(point.z / dr.detach(self.focus_distance) - 1)
 
     def pixels_per_unit(self, point: FilmPoint) -> mi.Float:
-        to_sample = dr.detach(self.to_sample)
-        scale = dr.maximum(dr.abs(to_sample[0, 0]) * self.crop_size.x, dr.abs(to_sample[1, 1]) * self.crop_size.y)
-        if self.orthographic:
-            scale *= dr.norm(dr.detach(self.to_local) @ mi.Vector3f(0, 1, 0))
-        return scale / dr.abs(point.w)
+        to_sample, to_local = dr.detach(self.to_sample), dr.detach(self.to_local).matrix
+        scales = []
+        for i in (0, 1):
+            # An orthographic sensor is as large as its transformation makes it, across but not along the view.
+            row = dr.norm(mi.Vector3f([to_local[i, k] for k in range(3)])) if self.orthographic else 1
+            scales.append(dr.abs(to_sample[i, i]) * self.crop_size[i] * row)
+        return dr.maximum(*scales) / dr.abs(point.w)
 
 
 @dataclass(frozen=True)

@@ -209,3 +209,11 @@ def test_fringe_of_coarse_lamps(coarse):
     scene = cases.scene(sensor=cases.camera(), lamp=lamp, floor=floor)
     found = [message for message in said(scene, "lamp.vertex_positions") if "coarse mesh" in message]
     assert len(found) == coarse and all('"lamp"' in message for message in found)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3])
+def test_scenes_of_the_size_of_the_ray_offset(size):
+    floor = cases.mesh("floor", size * np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]), [[0, 1, 2]])
+    sensor = cases.camera((0, 0, -5 * size), near_clip=1e-3 * size)
+    found = said(cases.scene(sensor=sensor, floor=floor, sky=cases.constant()), "floor.vertex_positions")
+    assert ["rays start" in message and "Make the scene larger" in message for message in found] == [True] * (size < 1)

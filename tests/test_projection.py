@@ -129,6 +129,33 @@ def test_tangents_and_parameters_are_derivatives(options):
     assert (difference <= 2e-2 * np.linalg.norm(tangent, axis=0))[good].all()
 
 
+LARGE = {"kind": "orthographic", "scale": [2e3, 3e3, 1]}
+
+
+@pytest.mark.parametrize("options", [*EDGES.values(), LARGE], ids=[*EDGES.keys(), "orthographic, large"])
+def test_how_many_pixels_a_length_covers(options):
+    """The most of a direction across the line of sight: exactly in the middle of a film, about that elsewhere."""
+    options = dict(options)
+    scale = options.pop("scale", None)
+    description = cases.camera(**options)
+    if scale is not None:
+        description["to_world"] = description["to_world"] @ mi.ScalarTransform4f().scale(scale)
+    projection = Projection(mi.load_dict(description))
+    a, _ = edges()
+    p = mi.Point3f(a * (scale[0] if scale else 1))
+    sight = projection.view() if projection.orthographic else dr.normalize(p - projection.eye())
+    frame, most = mi.Frame3f(sight), mi.Float(0)
+    for k in range(16):
+        s, c = dr.sincos(np.pi * k / 16)
+        q = mi.Point3f(p + frame.to_world(mi.Vector3f(c, s, 0)))
+        most = dr.maximum(most, dr.norm(projection.tangent(p, q, mi.Float(0))))
+    ratio = np.array(most / projection.pixels_per_unit(projection.film(p)))
+    half, seen = cases.RES / 2, np.array(projection.film(p).z) > projection.near
+    seen &= (np.abs(np.array(projection.film(p).position()) - half) < half).all(0)
+    assert seen.sum() > 20
+    assert (ratio[seen] > 0.95).all() and (ratio[seen] < 1.6).all(), (ratio[seen].min(), ratio[seen].max())
+
+
 def test_unknown_sensor_is_refused():
     sensor = mi.load_dict(
         {"type": "distant", "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}

@@ -35,7 +35,7 @@ from rimlight.edge_sampling import (
 
 from ._cut_rays import CutRays
 from ._finite import report_gradients, report_image, values_of
-from ._limits import Media, PartialParameters, beyond_far_plane, coarse_lamps, is_mirror, lets_through
+from ._limits import Media, PartialParameters, beyond_far_plane, coarse_lamps, is_mirror, lets_through, small_scene
 from ._options import check_options, is_whole
 from ._paths import Depths, Replay, Vertex, choose_vertex, scattered_light
 from ._scattering import Scattering, met_by, turn_to_side
@@ -621,7 +621,7 @@ class EdgeIntegrator(ADIntegrator):
                 'cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
             )
         if sppi > 0 and self.depths.scatters(1):
-            limits += coarse_lamps(scene)
+            limits += coarse_lamps(scene) + small_scene(scene)
         textures = jumping_textures(scene)
         if textures:
             limits.append(

@@ -125,6 +125,24 @@ def coarse_lamps(scene: mi.Scene) -> list[str]:
 FRINGE = 0.005
 
 
+def small_scene(scene: mi.Scene) -> list[str]:
+    """What the derivative lacks where the offset of Mitsuba's rays from surfaces is no longer small."""
+    lower, upper = (np.array(corner, np.float64).ravel() for corner in (scene.bbox().min, scene.bbox().max))
+    size, reach = np.linalg.norm(upper - lower), max(np.abs(lower).max(), np.abs(upper).max())
+    offset = float(mi.math.RayEpsilon) * (1 + reach)
+    if not np.isfinite(size) or offset <= LARGE_OFFSET * size:
+        return []
+    return [
+        f"shadows and reflections of curved surfaces are off by some per cent: Mitsuba's rays start {offset:.1g} units "
+        f"above a surface, and the whole scene measures {size:.1g}. Make the scene larger, so that it measures around "
+        "1, and bring it close to the origin."
+    ]
+
+
+#: Offset of rays from surfaces, relative to the diagonal of a scene, up to which there is no warning.
+LARGE_OFFSET = 0.005
+
+
 def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
     """What the derivative lacks where the far clipping plane of a sensor cuts through shapes.
 
