@@ -176,8 +176,9 @@ class ShadowBoundary:
             seen = first_hit(scene, ray, active)
             active &= seen.is_valid() & (seen.shape == fallen.shape)
             si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            # It sees this place, and nothing that lies before it: x was moved along the surface, and a little off it.
-            active &= dr.abs_dot(si.n, x - si.p) <= dr.norm(x - hit.p) + rounding(x, ray.o)
+            # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off
+            # it, but less than the ray will start above it.
+            active &= dr.abs_dot(si.n, x - si.p) <= lift + rounding(x, ray.o)
 
             # ---------------------- What arrives from the light ----------------------
 

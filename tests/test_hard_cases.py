@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from random_scenes import torus
 from test_edge_tree import bumpy_sphere
 
 from rimlight.edge_sampling import Geometry, Motion, ShadingBoundary, Silhouettes, derivative_image, find_edges
@@ -325,6 +326,22 @@ def test_film_boundary_does_not_depend_on_the_scale(scale):
         scene, motion = scaled(s, emitter=cases.light(1, 2, 3))
         films.append(mean_derivative(scene, motion, mi.load_dict({"type": "prb_edge", "max_depth": 1})))
     assert relative_difference(films[1], films[0]) < 0.01
+
+
+def test_shadows_on_what_throws_them_in_small_scenes():
+    """Points that a shadow was moved to are on the surface, also where the offset of rays is as large as its faces."""
+    points, _, _, faces = torus(28)
+    images = []
+    for scale in (1, 1 / 300):
+        description = {
+            "sensor": camera(scale * np.array([0.5, 2, -5]), (0, 0, 0), near_clip=0.01 * scale),
+            "thing": cases.mesh("thing", scale * points, faces, bsdf=cases.diffuse(0.5)),
+            "sun": cases.sun(),
+        }
+        scene = cases.scene(**description)
+        motion = Motion(scene, "sun.to_world", rotate=[0.3, 0.2, 1])
+        images.append(mean_derivative(scene, motion, mi.load_dict({"type": "direct_edge", "sppc": 0, "sppp": 0})))
+    assert np.abs(images[1]).sum() == pytest.approx(np.abs(images[0]).sum(), rel=0.1)
 
 
 def test_small_scenes_give_finite_derivatives(integrator):
