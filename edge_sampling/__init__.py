@@ -4,6 +4,7 @@ from .batch import Batch, FilmPart, film_parts
 from .edge_importance import Cone, EdgeSample, Lobe, View, resample, sample_edge, stratified
 from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
+from .face_planes import FacePlanes
 from .film_boundary import BoundarySamples, FilmBoundary
 from .finite_differences import FiniteDifferences, finite_differences
 from .horizon import Horizon, Horizons
@@ -27,6 +28,7 @@ __all__ = [
     "EdgeSample",
     "EdgeTree",
     "Edges",
+    "FacePlanes",
     "FilmBoundary",
     "FilmPart",
     "FiniteDifferences",

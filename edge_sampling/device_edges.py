@@ -108,6 +108,13 @@ class DeviceEdges:
             found.append(dr.select(s == 0, 0, dr.sign(s * dr.dot(dr.lerp(a, b, t), to_viewer))))
         return dr.select(found[0] == found[1], found[0], 0)
 
+    def bend(self, positions: mi.Float, edge: mi.UInt32) -> mi.Float:
+        """By how much faces turn at an edge: square of the sine of the angle between their normals; 0 where these count
+        as coplanar, or are not two. Detached."""
+        first, second = (dr.normalize(n) for n in self.normals(positions, edge))
+        sine = dr.norm(dr.cross(first, second))
+        return dr.select(dr.gather(mi.Bool, self._two_faces, edge) & (sine > COPLANAR), dr.square(sine), 0)
+
     def is_silhouette_of_any(self, positions: mi.Float, edge: mi.UInt32, places: mi.Vector4f) -> mi.Bool:
         """Is the edge a silhouette as seen from one of the `places`, see `Lights.places`? Detached."""
         a, _ = self.end_points(positions, edge)

@@ -85,14 +85,16 @@ class FilmBoundary:
     edges : of their meshes, on the host.
     moving : see `Geometry.moving`; which of them can move over the film.
     lights : of the scene.
+    soft : are there lights with a size, or light that is scattered? Then a part of it may lie behind one face of a
+        smooth-shaded mesh, but not behind the next, and what is seen jumps at the edge (see `face_planes.py`).
     """
 
     DRJIT_STRUCT = dict.fromkeys(
-        ("edges", "corners", "horizons", "curves", "counts", "lights", "transmit")
+        ("edges", "corners", "horizons", "curves", "counts", "lights", "transmit", "soft")
     )  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights):
-        self.geometry, self.lights = geometry, lights
+    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights, *, soft: bool):
+        self.geometry, self.lights, self.soft = geometry, lights, soft
         edges, faces = edges.of_meshes(moving), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays.)
         self.edges = DeviceEdges(edges) if len(edges) else None
@@ -309,7 +311,7 @@ class FilmBoundary:
         lights: mi.Vector4f | None,
     ) -> mi.Float:
         """Length inside the frame of each edge, cut, horizon and piece of a curve, 0 where nothing can jump: pixels on
-        the film; of horizons and curves, an estimate."""
+        the film; less where little jumps; of horizons and curves, an estimate."""
         lengths = []
         if self.edges is not None:
             edge, face = (dr.arange(mi.UInt32, n) for n in self.counts[:2])
@@ -318,7 +320,9 @@ class FilmBoundary:
                 jumps |= self.edges.is_silhouette_of_any(positions, edge, lights)
             for a, b in (self.edges.end_points(positions, edge), self._cut(projection, positions, face)):
                 lengths.append(projection.clip(a, b).length)
-            lengths[0] = dr.select(jumps, lengths[0], 0)
+            # The less faces turn, the less their planes hide: about as the square of the angle.
+            bend = self.edges.bend(positions, edge) * lengths[0] if self.soft and self.edges.any_smooth else 0
+            lengths[0] = dr.select(jumps, lengths[0], bend)
         if self.horizons is not None:
             face = dr.arange(mi.UInt32, self.counts[2])
             eye, far, radius = projection.viewer(), projection.orthographic, projection.lens_radius()

@@ -16,6 +16,7 @@ from rimlight._plan import Plan, PlannedTerm, names
 from rimlight.edge_sampling import (
     Batch,
     Edges,
+    FacePlanes,
     FilmBoundary,
     FilmPart,
     Geometry,
@@ -101,6 +102,7 @@ class Boundaries:
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
     shading: ShadingBoundary | None = None
+    planes: FacePlanes | None = None
     moving: tuple[bool, ...] = ()
     camera_moves: bool = False
     lights_move: bool = False
@@ -124,6 +126,9 @@ class EdgeIntegrator(ADIntegrator):
 
     #: Names of the properties. Subclasses that have more extend them.
     OPTIONS: tuple[str, ...] = ("sppc", "sppp", "sppi", "hide_emitters")
+
+    #: Does the derivative have what the planes of faces do to soft light, where other normals shade?
+    SOFT = True
 
     #: Properties that are accepted, but have no effect.
     IDLE: tuple[str, ...] = ()
@@ -298,20 +303,11 @@ class EdgeIntegrator(ADIntegrator):
 
     def _seen_from_vertex(self, scene, sampler, choice, ray, shading: ShadingBoundary) -> mi.Spectrum:
         """What edges do to the light that a vertex of each path reflects: mi.Spectrum, (N,), zero, with a gradient."""
-        pi = self._first_hit(scene, ray, True)
-        first = self._camera_vertex(ray, pi)
-        vertex, chosen, scattered = first, pi.is_valid(), None
-        if self.depths.scatters(2):
-            vertex, chosen = choose_vertex(scene, sampler, first, self.depths, chosen)
-            scattered = lambda ray, pi, sampler, active: self._onwards(scene, vertex, ray, pi, sampler, active)
-        at_first = vertex.depth == 1
         with dr.resume_grad():
             placement = shading.silhouettes.placement()
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, at_first)
-            if self.depths.scatters(2):
-                # Vertices farther on follow their surfaces.
-                follow = mi.RayFlags.All | mi.RayFlags.FollowShape
-                si = dr.select(at_first, si, vertex.pi.compute_surface_interaction(vertex.ray, follow, chosen))
+        si, vertex, chosen = self._any_vertex(scene, sampler, ray)
+        at_first = vertex.depth == 1
+        scattered = lambda ray, pi, sampler, active: self._onwards(scene, vertex, ray, pi, sampler, active)
         L = shading.from_points(
             scene,
             placement,
@@ -322,10 +318,40 @@ class EdgeIntegrator(ADIntegrator):
             share_emission=at_first,
             emission=~at_first | shading.emission_at_first,
             scattering=self.depths.scatters(vertex.depth + 1),
-            scattered=scattered,
+            scattered=scattered if self.depths.scatters(2) else None,
         )
         with dr.resume_grad():
             return L * vertex.β
+
+    def _behind_faces(self, scene, sampler, ray, planes: FacePlanes) -> mi.Spectrum:
+        """What the planes of faces do to the light that a vertex of each path reflects: likewise."""
+        si, vertex, chosen = self._any_vertex(scene, sampler, ray)
+
+        def incident(ray, pi, y, sampler, active):
+            L = y.emitter(scene, active).eval(y, active)
+            if self.depths.scatters(2):
+                onwards = active & y.is_valid() & self.depths.scatters(vertex.depth + 1)
+                L += dr.select(onwards, self._onwards(scene, vertex, ray, pi, sampler, onwards), 0)
+            return L
+
+        L = planes.sample(scene, si, sampler, chosen, incident)
+        with dr.resume_grad():
+            return L * vertex.β
+
+    def _any_vertex(self, scene, sampler, ray) -> tuple[mi.SurfaceInteraction3f, Vertex, mi.Bool]:
+        """One vertex of each path at which light is scattered; and is there one? The surface is attached: to the ray
+        at the first vertex, farther on to the material point."""
+        pi = self._first_hit(scene, ray, True)
+        vertex, chosen = self._camera_vertex(ray, pi), pi.is_valid()
+        if self.depths.scatters(2):
+            vertex, chosen = choose_vertex(scene, sampler, vertex, self.depths, chosen)
+        at_first = vertex.depth == 1
+        with dr.resume_grad():
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, at_first)
+            if self.depths.scatters(2):
+                follow = mi.RayFlags.All | mi.RayFlags.FollowShape
+                si = dr.select(at_first, si, vertex.pi.compute_surface_interaction(vertex.ray, follow, chosen))
+        return si, vertex, chosen
 
     def _onwards(self, scene, vertex, ray, pi, sampler, active) -> mi.Spectrum:
         """Light that is scattered towards `vertex` by what `ray` meets past an edge."""
@@ -356,7 +382,11 @@ class EdgeIntegrator(ADIntegrator):
             terms += [partial(self._shadows, scene, sensor, *part, sppi, weights, boundaries) for part in parts]
         if boundaries.shading is not None:
             boundaries.shading.refit()
-            terms.append(lambda: self._from_points(scene, sensor, seed, sppi, weights, mode, boundaries.shading))
+            edges = lambda sampler, choice, ray: self._seen_from_vertex(scene, sampler, choice, ray, boundaries.shading)
+            terms.append(lambda: self._from_points(scene, sensor, 0x55555555 ^ seed, sppi, weights, mode, edges))
+        if boundaries.planes is not None:
+            planes = lambda sampler, _, ray: self._behind_faces(scene, sampler, ray, boundaries.planes)
+            terms.append(lambda: self._from_points(scene, sensor, 0x33333333 ^ seed, sppi, weights, mode, planes))
         return sensor.film(), terms
 
     def sample_rays(self, scene, sensor, sampler):
@@ -396,14 +426,16 @@ class EdgeIntegrator(ADIntegrator):
             value = Sample(mi.Spectrum(s.value * (weights * part.area)), mi.Float(0))
             return Term(part.to_film(s.position), value, s.wavelengths, 0.0, 0)
 
-    def _from_points(self, scene, sensor, seed, sppi, weights, mode, shading: ShadingBoundary) -> Term:
-        """Boundaries as seen from one vertex of each path."""
-        seed = 0x55555555 ^ seed
+    def _from_points(self, scene, sensor, seed, sppi, weights, mode, reflected: Callable[..., mi.Spectrum]) -> Term:
+        """Boundaries as seen from one vertex of each path.
+
+        reflected : maps (sampler, which part of the samples each is, camera rays) to what they do to its light.
+        """
         sampler, sppi = self._sampler(sensor, seed, sppi)
         ray, ray_weight, position = self.sample_rays(scene, sensor, sampler)
         choice = stratified(sampler, seed)
         rays = CutRays(mode)
-        L = self._seen_from_vertex(scene, sampler, choice, rays(ray), shading)
+        L = reflected(sampler, choice, rays(ray))
         with dr.resume_grad():
             value = Sample(mi.Spectrum(L * ray_weight * (weights / sppi)), mi.Float(0))
             return Term(position, value, ray.wavelengths, 0.0, sppi, rays=rays)
@@ -472,6 +504,14 @@ class EdgeIntegrator(ADIntegrator):
             "light that is scattered may be occluded" if segments > 2 else "glossy surfaces, or an environment",
             still if shadows is None else "direct light: found from the lights",
         )
+        add(
+            "planes of faces",
+            sppi * pixels,
+            1 + path,
+            boundaries.planes is not None,
+            "interpolated normals, or normal maps, in soft light",
+            "nothing that moves" if sppi else '"sppi" is 0',
+        )
         shapes = zip((*self._geometry.meshes, *self._geometry.analytic), boundaries.moving, strict=False)
         return Plan(
             integrator=self.name,
@@ -532,11 +572,18 @@ class EdgeIntegrator(ADIntegrator):
         if key not in self._boundaries:
             self._refuse_while_recording()
             on_film = np.array([m or camera_moves for m in moving], bool)
-            film = FilmBoundary(geometry, self._edges, on_film, Lights(scene)) if on_film.any() else None
+            soft = self.depths.scatters(2) or any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
+            soft = soft and self.depths.scatters(1) and self.SOFT
+            film = FilmBoundary(geometry, self._edges, on_film, Lights(scene), soft=soft) if on_film.any() else None
             film = film if film is not None and any(film.counts) else None
+            # (The camera alone moves nothing that planes hide.)
+            planes = FacePlanes(scene) if soft and sppi and (lights_move or any(moving)) else None
+            planes = planes if planes is not None and len(planes) else None
             shadows, shading = self._light_boundaries(scene, moving, camera_moves or lights_move, sppi)
             lasting = self._limits(scene, moving, camera_moves, lights_move, sppi)
-            self._boundaries[key] = Boundaries(film, shadows, shading, moving, camera_moves, lights_move, lasting)
+            self._boundaries[key] = Boundaries(
+                film, shadows, shading, planes, moving, camera_moves, lights_move, lasting
+            )
         boundaries = self._boundaries[key]
         if boundaries.shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
             boundaries.shading.boxes.find_shapes()

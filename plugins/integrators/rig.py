@@ -92,10 +92,12 @@ class RigIntegrator(EdgeIntegrator):
     :monosp:`rimlight.edge_sampling.exr` has :monosp:`write_layers` and :monosp:`read_layers` for OpenEXR files with
     named layers.
 
-    **Limits.** Those of ``prb_edge``. Shadows under an environment and all that edges do to indirect light are taken
-    not to move, with a warning, unless ``sppi`` is 0. Discs of ``distant_lights`` need ``hide_emitters`` and a scene
-    without perfect mirrors, since nobody knows which of them a ray hits. Spectral variants are not supported. Filters
-    other than ``box`` are right, and slower in proportion to the pixels that they cover.
+    **Limits.** Those of ``prb_edge``. In light of lamps with a size, coarse smooth-shaded meshes are off by some
+    per cent, since their faces hide light from themselves, which ``direct_edge`` and ``prb_edge`` follow. Shadows
+    under an environment and all that edges do to indirect light are taken not to move, with a warning, unless
+    ``sppi`` is 0. Discs of ``distant_lights`` need ``hide_emitters`` and a scene without perfect mirrors, since
+    nobody knows which of them a ray hits. Spectral variants are not supported. Filters other than ``box`` are
+    right, and slower in proportion to the pixels that they cover.
 
     .. tabs::
         .. code-tab:: xml
@@ -111,6 +113,7 @@ class RigIntegrator(EdgeIntegrator):
     """
 
     OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth", "lights_per_path")
+    SOFT = False
 
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()

@@ -1,0 +1,82 @@
+"""The planes of faces: what they hide where other normals than theirs shade.
+
+Light that arrives from behind a face does not reach it: rays towards it start behind the face, and what is there is in
+the way. Where the normal of the face shades, its cosine is zero in its plane, and nothing jumps. But interpolated
+normals, and normal maps, go on being lit. So, at a point x of a face with normal n, the integrand F Lᵢ of reflected
+light jumps where n · ω = 0; and as the face turns, or as the points y that are seen there
+move, the derivative of the integral gains
+
+    ∮ (F⁺ L⁺ ġ⁺ − F⁻ L⁻ ġ⁻) dφ,        g = n · (y − x) / |y − x|
+
+over the directions ω(φ) in the plane; with the BSDF times its cosine F, the light L and its point y just above the
+plane, and just below. As in
+`shading_boundary.py`, y is a *material point*, which the interior derivative holds fixed.
+
+What a camera sees of such faces jumps at the edges between them (`film_boundary.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .meshes import has_interpolated_normals, has_normal_map
+
+#: Sine of the angle between the plane and the directions just beside it.
+BESIDE_PLANE = 1e-5
+
+
+class FacePlanes:
+    """Samples the planes of those shapes of a scene that other normals than theirs shade."""
+
+    DRJIT_STRUCT = dict.fromkeys(("_shapes",))  # for `dr.freeze`
+
+    def __init__(self, scene: mi.Scene):
+        shapes = [s for s in scene.shapes() if (s.is_mesh() and has_interpolated_normals(s)) or has_normal_map(s)]
+        self._shapes = [mi.ShapePtr(s) for s in shapes]
+
+    def __len__(self) -> int:
+        return len(self._shapes)
+
+    def sample(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+        incident: Callable[[Any, Any, Any, Any, Any], mi.Spectrum],
+    ) -> mi.Spectrum:
+        """One sample of the integral at each of `si`: mi.Spectrum, (N,), zero, with its gradient.
+
+        incident : maps (ray, what it meets, its surface, sampler, active) to the light that arrives; detached.
+        """
+        with dr.suspend_grad():
+            at = dr.detach(si)
+            ours = mi.Bool(False)
+            for shape in self._shapes:
+                ours |= at.shape == shape
+            s, c = dr.sincos(dr.two_pi * sampler.next_1d())
+            frame = mi.Frame3f(at.n)
+            ω = frame.s * c + frame.t * s
+            active = active & ours & at.is_valid()
+            sides = []
+            for side in (1, -1):
+                ray = at.spawn_ray(dr.normalize(ω + side * BESIDE_PLANE * at.n))
+                # (Mitsuba's `normalmap` reflects nothing that arrives from behind the face.)
+                F = dr.two_pi * at.bsdf().eval(mi.BSDFContext(), at, at.to_local(ray.d), active)
+                reflects = active & dr.any(F != 0)
+                pi = scene.ray_intersect_preliminary(ray, active=reflects)
+                y = pi.compute_surface_interaction(ray, mi.RayFlags.All, reflects)
+                L = incident(ray, pi, y, sampler.clone(), reflects)
+                sides.append((ray, pi, reflects & y.is_valid(), dr.select(reflects, side * F * L, 0)))
+        value = mi.Spectrum(0)
+        with dr.resume_grad():
+            for ray, pi, valid, jump in sides:
+                y = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, valid).p
+                # What is infinitely far away is seen in a fixed direction.
+                g = dr.dot(si.n, dr.normalize(dr.select(valid, y - si.p, mi.Vector3f(ω))))
+                value += jump * dr.select(active, g - dr.detach(g), 0)
+        return value

@@ -1,0 +1,83 @@
+"""Faces of coarse meshes hide light from themselves, where interpolated normals or normal maps go on being lit."""
+
+from __future__ import annotations
+
+import cases
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from random_scenes import ball
+
+from rimlight.edge_sampling import Motion, derivative_image, finite_differences
+
+DIRECT, INDIRECT = {"type": "direct_edge"}, {"type": "prb_edge", "max_depth": 3, "rr_depth": 100}
+
+
+def coarse_ball(*, smooth: bool = True, bumpy: bool = False, lamp: str = "disk", wall: bool = False) -> mi.Scene:
+    points, _, uv, faces = ball(6)
+    turned = np.array(mi.ScalarTransform4f().rotate([1, 2, 3], 37).matrix)[:3, :3]
+    bsdf = cases.diffuse(0.5)
+    if bumpy:
+        slopes = np.full((4, 4, 3), 0.5)
+        slopes[..., 0], slopes[..., 2] = np.random.default_rng(1).uniform(0.2, 0.8, (4, 4)), 0.9
+        bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(slopes.astype(np.float32)), "raw": True}
+        bsdf = {"type": "normalmap", "normalmap": bitmap, "bsdf": bsdf}
+    lamps = {
+        "disk": {
+            "to_world": mi.ScalarTransform4f().look_at([3, 3, -0.5], [0, 0, 0], [0, 1, 0]),
+            "emitter": cases.light(20, 20, 20),
+        },
+        "constant": {},
+    }
+    things = {"ball": cases.mesh("ball", points @ turned.T, faces, normals=smooth, uv=uv, bsdf=bsdf)}
+    things["lamp"] = {"type": lamp, **lamps[lamp]}
+    if wall:
+        things["wall"] = cases.quad(
+            (-3, -1.2, -2), (6, 0, 0), (0, 0, 4), "wall", bsdf=cases.diffuse(0.8, two_sided=True)
+        )
+    film = cases.film(width=16, height=16, pixel_format="luminance")
+    return cases.scene(sensor=cases.camera((0, 0, -5), fov=30, film=film), **things)
+
+
+TURN = {"key": "ball.vertex_positions", "rotate": [3, 5, 8]}
+SCENES = {
+    "turns": (coarse_ball, TURN, DIRECT),
+    "camera": (coarse_ball, {"key": "sensor.to_world", "direction": [1, 0, 0]}, DIRECT),
+    "lamp moves": (coarse_ball, {"key": "lamp.to_world", "direction": [1, 0, 0]}, DIRECT),
+    "sky": (lambda: coarse_ball(lamp="constant"), TURN, DIRECT),
+    "normal map": (lambda: coarse_ball(smooth=False, bumpy=True), TURN, DIRECT),
+    "indirect": (lambda: coarse_ball(wall=True), TURN, INDIRECT),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_agrees_with_finite_differences(name):
+    make, motion, integrator = SCENES[name]
+    scene, integrator = make(), mi.load_dict(integrator)
+    motion = Motion(scene, **motion)
+    path = mi.load_dict({"type": "path", "max_depth": 3 if name == "indirect" else 2, "rr_depth": 100})
+    reference = finite_differences(scene, motion, step=4e-3, runs=16, spp=4096, integrator=path)
+    images = np.array([derivative_image(scene, integrator, motion, spp=1024, seed=i) for i in range(8)], np.float64)
+    mean, error = images.mean(0), images.std(0, ddof=1) / np.sqrt(len(images))
+    size = np.abs(reference.mean).sum()
+    noise = np.sqrt(2 / np.pi) * np.hypot(error, reference.standard_error).sum() / size
+    relative = np.abs(mean - reference.mean).sum() / size
+    print(f"relative L1 {relative:.4f}, of noise {noise:.4f}")
+    assert relative <= 0.02 + 1.2 * noise
+
+
+@pytest.mark.parametrize("name", ["turns", "lamp moves", "indirect"])
+def test_backward(name):
+    """As forward."""
+    make, motion, integrator = SCENES[name]
+    scene, integrator = make(), mi.load_dict(integrator)
+    motion = Motion(scene, **motion)
+    weight = np.random.default_rng(2).uniform(size=(16, 16, 1)).astype(np.float32)
+    forward = (np.array(derivative_image(scene, integrator, motion, spp=64, seed=1), np.float64) * weight).sum()
+    θ = mi.Float(0)
+    dr.enable_grad(θ)
+    motion.apply(θ)
+    image = mi.render(scene, motion.params, integrator=integrator, spp=64, seed=2, seed_grad=1)
+    dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
+    assert np.array(dr.grad(θ))[0] == pytest.approx(forward, rel=2e-3)
