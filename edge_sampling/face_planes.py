@@ -35,11 +35,8 @@ class FacePlanes:
     DRJIT_STRUCT = dict.fromkeys(("_shapes",))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene):
-        shapes = [s for s in scene.shapes() if (s.is_mesh() and has_interpolated_normals(s)) or has_normal_map(s)]
-        self._shapes = [mi.ShapePtr(s) for s in shapes]
-
-    def __len__(self) -> int:
-        return len(self._shapes)
+        self.shapes = [s for s in scene.shapes() if (s.is_mesh() and has_interpolated_normals(s)) or has_normal_map(s)]
+        self._shapes = [mi.ShapePtr(s) for s in self.shapes]
 
     def sample(
         self,

@@ -576,9 +576,7 @@ class EdgeIntegrator(ADIntegrator):
             soft = soft and self.depths.scatters(1) and self.SOFT
             film = FilmBoundary(geometry, self._edges, on_film, Lights(scene), soft=soft) if on_film.any() else None
             film = film if film is not None and any(film.counts) else None
-            # (The camera alone moves nothing that planes hide.)
-            planes = FacePlanes(scene) if soft and sppi and (lights_move or any(moving)) else None
-            planes = planes if planes is not None and len(planes) else None
+            planes = self._face_planes(scene, moving, lights_move) if soft and sppi else None
             shadows, shading = self._light_boundaries(scene, moving, camera_moves or lights_move, sppi)
             lasting = self._limits(scene, moving, camera_moves, lights_move, sppi)
             self._boundaries[key] = Boundaries(
@@ -630,6 +628,15 @@ class EdgeIntegrator(ADIntegrator):
         shading = ShadingBoundary(scene, silhouettes, moving_shapes)
         needed = self.depths.scatters(2) or shading.emission_at_first
         return shadows if len(shadows) else None, shading if needed else None
+
+    def _face_planes(self, scene, moving, lights_move) -> FacePlanes | None:
+        """What samples the planes of faces, if what they hide can change: where the faces move, or what lights them.
+        (The camera alone moves neither.)"""
+        planes = FacePlanes(scene)
+        shapes = zip((*self._geometry.meshes, *self._geometry.analytic), moving, strict=True)
+        moving_shapes = [s for s, moves in shapes if moves]
+        what_lights = lights_move or (moving_shapes and self.depths.scatters(2))
+        return planes if planes.shapes and (what_lights or any(s in moving_shapes for s in planes.shapes)) else None
 
     def _lights_move(self, scene, moving) -> bool:
         """Do meshes that emit light move, or lights that are no shapes?"""
