@@ -3,14 +3,13 @@
 Light that arrives from behind a face does not reach it: rays towards it start behind the face, and what is there is in
 the way. Where the normal of the face shades, its cosine is zero in its plane, and nothing jumps. But interpolated
 normals, and normal maps, go on being lit. So, at a point x of a face with normal n, the integrand F Lᵢ of reflected
-light jumps where n · ω = 0; and as the face turns, or as the points y that are seen there
-move, the derivative of the integral gains
+light jumps where n · ω = 0; and as the face turns, or as the points y that are seen there move, the derivative of the
+integral gains
 
     ∮ (F⁺ L⁺ ġ⁺ − F⁻ L⁻ ġ⁻) dφ,        g = n · (y − x) / |y − x|
 
 over the directions ω(φ) in the plane; with the BSDF times its cosine F, the light L and its point y just above the
-plane, and just below. As in
-`shading_boundary.py`, y is a *material point*, which the interior derivative holds fixed.
+plane, and just below. As in `shading_boundary.py`, y is a *material point*, which the interior derivative holds fixed.
 
 What a camera sees of such faces jumps at the edges between them (`film_boundary.py`).
 """

@@ -64,7 +64,17 @@ def test_agrees_with_finite_differences(name):
     noise = np.sqrt(2 / np.pi) * np.hypot(error, reference.standard_error).sum() / size
     relative = np.abs(mean - reference.mean).sum() / size
     print(f"relative L1 {relative:.4f}, of noise {noise:.4f}")
+    assert noise < 0.25
     assert relative <= 0.02 + 1.2 * noise
+
+
+def test_rig_says_that_it_lacks_this():
+    scene = coarse_ball()
+    params = mi.traverse(scene)
+    dr.enable_grad(params["ball.vertex_positions"])
+    params.update()
+    found = [limit for limit in mi.load_dict({"type": "rig"}).plan(scene).limits if '"ball"' in limit]
+    assert len(found) == 1 and "face normals" in found[0]
 
 
 @pytest.mark.parametrize("name", ["turns", "lamp moves", "indirect"])

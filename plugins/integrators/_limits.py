@@ -101,27 +101,42 @@ class Media:
 def coarse_lamps(scene: mi.Scene) -> list[str]:
     """What the derivative lacks of the light that smooth-shaded meshes throw: Mitsuba reckons it with interpolated
     normals, but faces turn away one after the other, each while its light is not yet 0."""
-    limits = []
-    for e in scene.emitters():
-        shape = e.get_shape()
-        if shape is None or not shape.is_mesh() or not has_interpolated_normals(shape):
-            continue
-        corners, normals = faces(shape), np.array(dr.detach(shape.vertex_normals_buffer())).reshape(-1, 3)
-        p = vertices(shape)[corners].astype(np.float64)
-        flat = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None]
-        n = normals[corners]
-        size = np.linalg.norm(flat, axis=2) * np.linalg.norm(n, axis=2)
-        cos = np.abs((flat * n).sum(2))[size > 0] / size[size > 0]
-        if cos.size and 1 - cos.min() > FRINGE:
-            limits.append(
-                f"where the light of {names([shape])[0]} falls, the derivative is off by up to about "
-                f"{100 * (1 - cos.min()):.1g} %, since Mitsuba shades the faces of its coarse mesh with interpolated "
-                "normals. Give it a finer mesh or face normals."
-            )
-    return limits
+    shapes = [e.get_shape() for e in scene.emitters() if e.get_shape() is not None]
+    return [
+        f"where the light of {names([s])[0]} falls, the derivative is off by up to about {100 * _fringe(s):.1g} %, "
+        "since Mitsuba shades the faces of its coarse mesh with interpolated normals. Give it a finer mesh or face "
+        "normals."
+        for s in shapes
+        if _fringe(s) > FRINGE
+    ]
 
 
-#: How far the cosine between the normals of faces and vertices of a lamp may be below 1, without a warning.
+def coarse_meshes(scene: mi.Scene) -> list[str]:
+    """What a derivative without `FacePlanes` lacks: the faces of smooth-shaded meshes hide light from themselves."""
+    sized = [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Delta and not hasattr(e, "light_count")]
+    coarse = names(s for s in scene.shapes() if _fringe(s) > FRINGE) if sized else []
+    if not coarse:
+        return []
+    return [
+        f"the derivative lacks what the faces of {', '.join(coarse)} hide of lamps with a size, while interpolated "
+        "normals go on being lit. Give them finer meshes or face normals, or use direct_edge or prb_edge."
+    ]
+
+
+def _fringe(shape: mi.Shape) -> float:
+    """How far the cosine between the normals of faces and vertices is below 1, at most; 0 without interpolated ones."""
+    if not shape.is_mesh() or not has_interpolated_normals(shape):
+        return 0.0
+    corners, normals = faces(shape), np.array(dr.detach(shape.vertex_normals_buffer())).reshape(-1, 3)
+    p = vertices(shape)[corners].astype(np.float64)
+    flat = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None]
+    n = normals[corners]
+    size = np.linalg.norm(flat, axis=2) * np.linalg.norm(n, axis=2)
+    cos = np.abs((flat * n).sum(2))[size > 0] / size[size > 0]
+    return float(1 - cos.min()) if cos.size else 0.0
+
+
+#: How far the cosine between the normals of faces and vertices may be below 1, without a warning.
 FRINGE = 0.005
 
 

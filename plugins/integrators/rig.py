@@ -12,6 +12,7 @@ from ._edge_integrator import HARD_SHADOWS, EdgeIntegrator
 from ._finite import report_gradients, report_image
 from ._layers import Layers, LayerSamples
 from ._light_paths import Backward, Forward, LightPaths, Measure, Splat
+from ._limits import coarse_meshes
 from ._options import is_whole
 
 SHADOWS_ON_FILM = (
@@ -93,11 +94,11 @@ class RigIntegrator(EdgeIntegrator):
     named layers.
 
     **Limits.** Those of ``prb_edge``. In light of lamps with a size, coarse smooth-shaded meshes are off by some
-    per cent, since their faces hide light from themselves, which ``direct_edge`` and ``prb_edge`` follow. Shadows
-    under an environment and all that edges do to indirect light are taken not to move, with a warning, unless
-    ``sppi`` is 0. Discs of ``distant_lights`` need ``hide_emitters`` and a scene without perfect mirrors, since
-    nobody knows which of them a ray hits. Spectral variants are not supported. Filters other than ``box`` are
-    right, and slower in proportion to the pixels that they cover.
+    per cent, since their faces hide light from themselves, which ``direct_edge`` and ``prb_edge`` follow: there is
+    a warning. Shadows under an environment and all that edges do to indirect light are taken not to move, with a
+    warning, unless ``sppi`` is 0. Discs of ``distant_lights`` need ``hide_emitters`` and a scene without perfect
+    mirrors, since nobody knows which of them a ray hits. Spectral variants are not supported. Filters other than
+    ``box`` are right, and slower in proportion to the pixels that they cover.
 
     .. tabs::
         .. code-tab:: xml
@@ -236,7 +237,7 @@ class RigIntegrator(EdgeIntegrator):
         limits = super()._limits(scene, moving, camera_moves, lights_move, sppi)
         if sppi > 0 and (self.depths.scatters(2) or scene.environment() is not None):
             limits = (*(limit for limit in limits if limit != HARD_SHADOWS), SHADOWS_ON_FILM)
-        return limits
+        return (*limits, *coarse_meshes(scene)) if sppi > 0 and self.depths.scatters(1) else limits
 
     def sample_rays(self, scene, sensor, sampler):
         if self.pixel_density is None:
