@@ -1,10 +1,10 @@
 """The planes of faces: what they hide where other normals than theirs shade.
 
-Light that arrives from behind a face does not reach it: rays towards it start behind the face, and what is there is in
-the way. Where the normal of the face shades, its cosine is zero in its plane, and nothing jumps. But interpolated
-normals, and normal maps, go on being lit. So, at a point x of a face with normal n, the integrand F Lᵢ of reflected
-light jumps where n · ω = 0; and as the face turns, or as the points y that are seen there move, the derivative of the
-integral gains
+Light that arrives from behind a face does not reach it: rays towards it start behind the face, and what is there is
+in the way. Where the normal of the face shades, its cosine is zero in its plane, and nothing jumps. But interpolated
+normals, and normal maps with `use_shadowing_function` off, go on being lit. So, at a point x of a face with normal n,
+the integrand F Lᵢ of reflected light jumps where n · ω = 0; and as the face turns, or as the points y that are seen
+there move, the derivative of the integral gains
 
     ∮ (F⁺ L⁺ ġ⁺ − F⁻ L⁻ ġ⁻) dφ,        g = n · (y − x) / |y − x|
 
