@@ -11,6 +11,9 @@ import numpy as np
 
 from .curves import CURVES
 
+#: Interpolated normals are those of a face if the sine of the angle between them is at most so large.
+BENT = 1e-3
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -112,6 +115,20 @@ def vertex_attributes(mesh: Any) -> dict[str, mi.Float]:
 
 def has_interpolated_normals(mesh: Any) -> bool:
     return mesh.has_vertex_normals() and not mesh.has_face_normals()
+
+
+def bent_faces(mesh: Any) -> mi.Bool:
+    """Which faces of a mesh with interpolated normals are shaded with others than their own: (F,), detached. Not those
+    of `cube`, whose vertices are split."""
+    p, n = dr.detach(mesh.vertex_positions_buffer()), dr.detach(mesh.vertex_normals_buffer())
+    face = 3 * dr.arange(mi.UInt32, mesh.face_count())
+    vertices = [dr.gather(mi.UInt32, mesh.faces_buffer(), face + k) for k in range(3)]
+    a, b, c = (dr.gather(mi.Point3f, p, v) for v in vertices)
+    own = dr.normalize(dr.cross(b - a, c - a))
+    bent = mi.Bool(False)
+    for v in vertices:
+        bent |= dr.norm(dr.cross(dr.gather(mi.Normal3f, n, v), own)) > BENT
+    return bent
 
 
 def jumps_at_every_edge(mesh: Any) -> bool:

@@ -3,7 +3,7 @@
 Edges are found on the host, which takes seconds for a million of them; an optimisation step takes milliseconds. So they
 are kept as long as what they were derived from stays as it was: which shapes, materials and lights there are, their
 faces, which vertices lie at the same place, and where attributes differ between those. Vertices may move, as long as
-none of them part, and none meet.
+none of them part, and none meet, and the vertex normals of flat faces stay theirs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .edges import Edges, Weld
-from .meshes import Geometry, has_interpolated_normals, vertex_attributes
+from .meshes import Geometry, bent_faces, has_interpolated_normals, vertex_attributes
 
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
 APART = 64
@@ -45,11 +45,15 @@ class Sources:
         #: Mesh → its pairs of vertices at the two sides of edges.
         self._seams = _seams(geometry, edges)
         self._attributes = {i: tuple(vertex_attributes(geometry.meshes[i])) for i in self._seams}
+        #: Meshes with interpolated normals that are those of the faces: `FacePlanes` leaves them out.
+        self._flat = [
+            i for i, m in enumerate(geometry.meshes) if has_interpolated_normals(m) and not dr.any(bent_faces(m))[0]
+        ]
         self._held = self._arrays(geometry)
         self._differing = {
             (i, name): self._differ(i, array)
             for (i, name), array in self._held.items()
-            if i in self._seams and name not in ("faces", "positions")
+            if i in self._seams and name not in ("faces", "positions", "normals")
         }
         dr.eval(self._differing)
         #: Vertices at different places, and pairs at the same place.
@@ -73,7 +77,8 @@ class Sources:
         return same and numbers == self._numbers
 
     def same_content(self, geometry: Geometry) -> bool:
-        """Are the faces the same, and which vertices lie at the same place, and where attributes differ between those?
+        """Are the faces the same, and which vertices lie at the same place, and where attributes differ between those;
+        and are those meshes flat-shaded that were?
 
         Reads one bit from the device, or nothing if no array was replaced. (Where one was, Mitsuba has just waited for
         the device, to find the bounding box.) Not in frozen functions.
@@ -86,8 +91,9 @@ class Sources:
         for i, name in replaced:
             if name == "faces":
                 changes.append(new[i, name] != self._held[i, name])
-            elif name != "positions":
+            elif name not in ("positions", "normals"):
                 changes.append(self._differ(i, new[i, name]) != self._differing[i, name])
+        changes += [bent_faces(geometry.meshes[i]) for i, name in replaced if name == "normals"]
         if any(name == "positions" for _, name in replaced):
             changes += self._parted_or_met(dr.detach(geometry.positions()))
         changed = mi.Bool(False)
@@ -104,6 +110,8 @@ class Sources:
         for i, mesh in enumerate(geometry.meshes):
             arrays[i, "faces"] = mesh.faces_buffer()
             arrays[i, "positions"] = dr.detach(mesh.vertex_positions_buffer())
+            if i in self._flat:
+                arrays[i, "normals"] = dr.detach(mesh.vertex_normals_buffer())
             if i in self._seams:
                 if mesh.has_vertex_texcoords():
                     arrays[i, "texcoords"] = dr.detach(mesh.vertex_texcoords_buffer())

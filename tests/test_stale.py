@@ -211,6 +211,29 @@ def test_scenes_that_are_freed():
         del scene
 
 
+@pytest.mark.parametrize("kind", ["direct_edge", "prb_edge"])
+def test_flat_square_is_folded(kind):
+    """Only then are its faces shaded with other normals than their own."""
+    square = cases.mesh(
+        "square", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 2, 1], [0, 3, 2]], normals=True
+    )
+    lamp = {
+        "type": "disk",
+        "to_world": mi.ScalarTransform4f().look_at([2, 2, -0.5], [0, 0, 0], [0, 0, 1]),
+        "emitter": cases.light(20, 20, 20),
+    }
+    film = cases.film(width=16, height=16, pixel_format="luminance")
+    scene = cases.scene(sensor=cases.camera((0, 0, -5), fov=30, film=film), square=square, lamp=lamp)
+    make = lambda: mi.load_dict(KINDS[kind])
+    used = make()
+    flat = assert_as_fresh(scene, used, make, "square.vertex_positions", rotate=[30, 20, 10])
+    params = mi.traverse(scene)
+    params["square.vertex_positions"] = [-1, -1, -1, 1, -1, 0, 1, 1, -1, -1, 1, 0]
+    params.update()
+    folded = assert_as_fresh(scene, used, make, "square.vertex_positions", rotate=[30, 20, 10])
+    assert np.abs(folded - flat).sum() > 0.1 * np.abs(flat).sum()
+
+
 # ---------------------- What is not renewed ----------------------
 
 
