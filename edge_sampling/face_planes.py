@@ -22,7 +22,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .meshes import bent_faces, has_interpolated_normals, has_normal_map
+from .meshes import has_normal_map, is_smooth
 
 #: Sine of the angle between the plane and the directions just beside it.
 BESIDE_PLANE = 1e-5
@@ -34,7 +34,7 @@ class FacePlanes:
     DRJIT_STRUCT = dict.fromkeys(("_shapes",))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene):
-        self.shapes = [s for s in scene.shapes() if _is_bent(s) or has_normal_map(s)]
+        self.shapes = [s for s in scene.shapes() if (s.is_mesh() and is_smooth(s)) or has_normal_map(s)]
         self._shapes = [mi.ShapePtr(s) for s in self.shapes]
 
     def sample(
@@ -76,8 +76,3 @@ class FacePlanes:
                 g = dr.dot(si.n, dr.normalize(dr.select(valid, y - si.p, mi.Vector3f(ω))))
                 value += jump * dr.select(active, g - dr.detach(g), 0)
         return value
-
-
-def _is_bent(shape: mi.Shape) -> bool:
-    """Do interpolated normals other than their own shade faces of the shape, as it is now? (`Sources` asks again.)"""
-    return shape.is_mesh() and has_interpolated_normals(shape) and bool(dr.any(bent_faces(shape))[0])

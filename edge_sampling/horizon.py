@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from .device_edges import rounding
-from .meshes import Geometry, has_interpolated_normals
+from .meshes import Geometry, is_smooth
 
 
 @dataclass
@@ -73,7 +73,7 @@ class Horizons:
 
     def __init__(self, geometry: Geometry, moving: np.ndarray):
         self.geometry = geometry
-        smooth = [bool(m) and has_interpolated_normals(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
+        smooth = [bool(m) and is_smooth(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
         #: (F, 3), their vertices.
         self.faces = faces = geometry.faces(tuple(smooth))
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []

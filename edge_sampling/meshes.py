@@ -117,6 +117,11 @@ def has_interpolated_normals(mesh: Any) -> bool:
     return mesh.has_vertex_normals() and not mesh.has_face_normals()
 
 
+def is_smooth(mesh: Any) -> bool:
+    """Do interpolated normals other than their own shade faces of the mesh, as it is now? (`Sources` asks again.)"""
+    return has_interpolated_normals(mesh) and bool(dr.any(bent_faces(mesh))[0])
+
+
 def bent_faces(mesh: Any) -> mi.Bool:
     """Which faces of a mesh with interpolated normals are shaded with others than their own: (F,), detached. Not those
     of `cube`, whose vertices are split."""

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .edges import Edges, Weld
-from .meshes import Geometry, bent_faces, has_interpolated_normals, vertex_attributes
+from .meshes import Geometry, bent_faces, has_interpolated_normals, is_smooth, vertex_attributes
 
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
 APART = 64
@@ -45,10 +45,8 @@ class Sources:
         #: Mesh → its pairs of vertices at the two sides of edges.
         self._seams = _seams(geometry, edges)
         self._attributes = {i: tuple(vertex_attributes(geometry.meshes[i])) for i in self._seams}
-        #: Meshes with interpolated normals that are those of the faces: `FacePlanes` leaves them out.
-        self._flat = [
-            i for i, m in enumerate(geometry.meshes) if has_interpolated_normals(m) and not dr.any(bent_faces(m))[0]
-        ]
+        #: Meshes with interpolated normals that are those of the faces: `FacePlanes` and `Horizons` leave them out.
+        self._flat = [i for i, m in enumerate(geometry.meshes) if has_interpolated_normals(m) and not is_smooth(m)]
         self._held = self._arrays(geometry)
         self._differing = {
             (i, name): self._differ(i, array)
