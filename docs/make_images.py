@@ -33,7 +33,7 @@ STEP, RUNS, REFERENCE_SPP = 2e-3, 8, 1024
 def overview(path: Path) -> None:
     """The derivative with respect to a camera motion: Rimlight, Mitsuba, finite differences."""
     from rimlight import pictures, scenes
-    from rimlight.edge_sampling import Motion, derivative_image, finite_differences
+    from rimlight.checks import Motion, derivative_image, finite_differences
 
     scene = mi.load_file(str(scenes.path("objects")), res=RES)
     motion = Motion(scene, "camera.to_world", direction=[1, 0, 0])

@@ -6,19 +6,16 @@ from .edge_tree import EdgeTree
 from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .face_planes import FacePlanes
 from .film_boundary import BoundarySamples, FilmBoundary
-from .finite_differences import FiniteDifferences, finite_differences
 from .horizon import Horizon, Horizons
 from .intersections import intersecting_meshes, t_junctions
 from .lights import Lights, has_hard_beam
 from .meshes import Geometry, jumping_textures, objects_below
-from .motion import Motion, derivative_image
 from .projection import Projection
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary, ShadowSamples
 from .silhouettes import Silhouettes
 from .smooth_lamps import SmoothLamps
 from .sources import Sources
-from .zscores import mean_and_error, z_scores
 
 __all__ = [
     "Batch",
@@ -31,13 +28,11 @@ __all__ = [
     "FacePlanes",
     "FilmBoundary",
     "FilmPart",
-    "FiniteDifferences",
     "Geometry",
     "Horizon",
     "Horizons",
     "Lights",
     "Lobe",
-    "Motion",
     "Projection",
     "ShadingBoundary",
     "ShadowBoundary",
@@ -47,19 +42,15 @@ __all__ = [
     "Sources",
     "View",
     "Weld",
-    "derivative_image",
     "film_parts",
     "find_edges",
     "find_welded_edges",
-    "finite_differences",
     "has_hard_beam",
     "intersecting_meshes",
     "jumping_textures",
-    "mean_and_error",
     "objects_below",
     "resample",
     "sample_edge",
     "stratified",
     "t_junctions",
-    "z_scores",
 ]

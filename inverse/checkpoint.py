@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rimlight.edge_sampling.exr import replacing
+from rimlight.exr import replacing
 
 #: Of the file's layout.
 VERSION = 1

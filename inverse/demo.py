@@ -16,8 +16,8 @@ from tqdm import tqdm
 
 import rimlight
 from rimlight import no_collection, pictures, scenes
-from rimlight.edge_sampling import Motion, derivative_image, finite_differences
-from rimlight.edge_sampling.exr import replacing
+from rimlight.checks import Motion, derivative_image, finite_differences
+from rimlight.exr import replacing
 
 from . import page
 from .fitting import fit

@@ -13,7 +13,7 @@ import tomli_w
 from cattrs.gen import make_dict_structure_fn
 from cattrs.strategies import configure_union_passthrough
 
-from rimlight.edge_sampling.exr import replacing
+from rimlight.exr import replacing
 from rimlight.loading import InputError
 
 if sys.version_info >= (3, 11):

@@ -24,7 +24,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import rimlight
 from rimlight import pictures
-from rimlight.edge_sampling.exr import replacing, write_exr
+from rimlight.exr import replacing, write_exr
 from rimlight.sys_info import processor
 
 from . import fitting, page

@@ -21,7 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rimlight import scenes
-from rimlight.edge_sampling.exr import replacing
+from rimlight.exr import replacing
 from rimlight.loading import one_line
 from rimlight.scenes import room, traffic_sign
 

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 from skimage.transform import resize
 
-from rimlight.edge_sampling.exr import read_exr
+from rimlight.exr import read_exr
 from rimlight.loading import one_line
 
 from .problem import Target

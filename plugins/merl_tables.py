@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rimlight.edge_sampling.exr import replacing
+from rimlight.exr import replacing
 
 #: Numbers of θ_h, θ_d, φ_d and colours.
 SHAPE = 90, 90, 180, 3

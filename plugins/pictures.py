@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from rimlight.edge_sampling.exr import replacing
+from rimlight.exr import replacing
 
 COLOUR_MAP = "RdBu_r"
 DPI = 130

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import rimlight
-from rimlight.edge_sampling import Batch, Motion, Projection, derivative_image, film_parts
+from rimlight.checks import Motion, derivative_image
+from rimlight.edge_sampling import Batch, Projection, film_parts
 
 SENSORS = {
     "whole": cases.batch,

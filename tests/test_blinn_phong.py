@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from bsdfs import chi_squared, context, direction, interaction, random_directions, random_numbers
 
-from rimlight.edge_sampling import Motion, derivative_image, finite_differences, mean_and_error, z_scores
+from rimlight.checks import Motion, derivative_image, finite_differences, mean_and_error, z_scores
 
 ROUGHNESSES = [1e-4, 1e-3, 0.02, 0.1, 0.3, 0.6, 1.0]
 ANGLES = [0.0, 30.0, 60.0, 80.0, 89.0, 89.9]

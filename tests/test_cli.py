@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from rimlight import scenes
+from rimlight.checks import FiniteDifferences, derivative_image
 from rimlight.cli import main
-from rimlight.edge_sampling import FiniteDifferences, derivative_image
-from rimlight.edge_sampling.exr import read_exr
+from rimlight.exr import read_exr
 from rimlight.loading import InputError, check_scene
 
 TRIANGLES = str(scenes.path("two_triangles"))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from random_scenes import ball
 
-from rimlight.edge_sampling import Motion, derivative_image, finite_differences
+from rimlight.checks import Motion, derivative_image, finite_differences
 
 DIRECT, INDIRECT = {"type": "direct_edge"}, {"type": "prb_edge", "max_depth": 3, "rr_depth": 100}
 

@@ -17,7 +17,7 @@ import pytest
 
 import rimlight
 from rimlight import _collection
-from rimlight.edge_sampling import Motion, derivative_image, finite_differences
+from rimlight.checks import Motion, derivative_image, finite_differences
 
 KEY = "cube0.vertex_positions"
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from constants import Number, numbers_in_source, numbers_in_table
 
-from rimlight.edge_sampling import Motion, derivative_image
+from rimlight.checks import Motion, derivative_image
 
-#: Modules that take no part in a derivative: references, files, checks, and the reading of options.
-OTHERS = {"__init__", "_finite", "_options", "exr", "finite_differences", "motion", "zscores"}
+#: Modules that take no part in a derivative: checks and the reading of options.
+OTHERS = {"__init__", "_finite", "_options"}
 
 
 def in_code(root) -> set[Number]:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import rimlight.scenes
-from rimlight.edge_sampling import Motion, derivative_image, mean_and_error, z_scores
-from rimlight.edge_sampling.exr import read_exr
+from rimlight.checks import Motion, derivative_image, mean_and_error, z_scores
+from rimlight.exr import read_exr
 
 
 def integrator(**options):

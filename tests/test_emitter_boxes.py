@@ -8,7 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight.edge_sampling import Geometry, Motion, derivative_image
+from rimlight.checks import Motion, derivative_image
+from rimlight.edge_sampling import Geometry
 from rimlight.edge_sampling.emitter_boxes import EmitterBoxes
 
 LIGHTS = {

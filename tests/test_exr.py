@@ -6,7 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from rimlight.edge_sampling.exr import read_exr, replacing, write_exr
+from rimlight.exr import read_exr, replacing, write_exr
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight.edge_sampling import Motion, derivative_image, mean_and_error, z_scores
+from rimlight.checks import Motion, derivative_image, mean_and_error, z_scores
 
 PATH = {"type": "path", "max_depth": 3}
 VARIANTS = ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_spectral_polarized"]

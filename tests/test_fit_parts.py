@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from skimage.transform import pyramid_reduce
 
-from rimlight.edge_sampling.exr import write_exr
+from rimlight.exr import write_exr
 from rimlight.inverse import losses, problem, targets
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Starts, Target
 

@@ -63,7 +63,7 @@ import os, signal, sys
 from rimlight import inverse
 import drjit as dr
 import numpy as np
-from rimlight.edge_sampling import exr
+from rimlight import exr
 from rimlight.inverse import checkpoint, fitting, problem
 
 dr.set_thread_count(1)

@@ -14,7 +14,8 @@ import pytest
 from random_scenes import torus
 from test_edge_tree import bumpy_sphere
 
-from rimlight.edge_sampling import Geometry, Motion, ShadingBoundary, Silhouettes, derivative_image, find_edges
+from rimlight.checks import Motion, derivative_image
+from rimlight.edge_sampling import Geometry, ShadingBoundary, Silhouettes, find_edges
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
 SIDE = [1, 0.3, 0.2]

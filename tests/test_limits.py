@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from random_scenes import ball
 
-from rimlight.edge_sampling import Geometry, Motion, derivative_image, find_edges, t_junctions
+from rimlight.checks import Motion, derivative_image
+from rimlight.edge_sampling import Geometry, find_edges, t_junctions
 
 FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from rimlight.edge_sampling import mean_and_error, z_scores
+from rimlight.checks import mean_and_error, z_scores
 from rimlight.merl_tables import GRAZING, SHAPE, angles, directions, elevation, half_difference, read_merl, write_merl
 
 KD, KS = np.array([0.3, 0.2, 0.1]), np.array([0.05, 0.06, 0.08])

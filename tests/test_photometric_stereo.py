@@ -12,7 +12,7 @@ import pytest
 from photometric import LAMBERT, UP, disc, glossy
 
 from rimlight import ggx
-from rimlight.edge_sampling import mean_and_error
+from rimlight.checks import mean_and_error
 from rimlight.inverse.photometric_stereo import reconstruction, refinement
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
 from rimlight.inverse.photometric_stereo.descent import ExponentiatedGradient, NormalAdam

@@ -13,7 +13,7 @@ from pages import Page, in_browser
 
 from rimlight import ggx
 from rimlight.cli import _ps, main
-from rimlight.edge_sampling.exr import read_exr, write_exr
+from rimlight.exr import read_exr, write_exr
 from rimlight.inverse.photometric_stereo import dataset, output, reconstruction, report, simulation
 from rimlight.inverse.photometric_stereo.dataset import angles, unit
 from rimlight.inverse.photometric_stereo.integration import normals_of

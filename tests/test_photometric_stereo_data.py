@@ -15,7 +15,7 @@ from PIL import Image
 
 from rimlight import ggx
 from rimlight.cli import main
-from rimlight.edge_sampling.exr import write_exr
+from rimlight.exr import write_exr
 from rimlight.inverse.photometric_stereo import calibration, dataset, least_squares
 from rimlight.inverse.photometric_stereo.calibration import Ball
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight.edge_sampling import Motion, derivative_image, mean_and_error, z_scores
+from rimlight.checks import Motion, derivative_image, mean_and_error, z_scores
 
 DEPTH = 4
 

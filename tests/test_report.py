@@ -15,7 +15,7 @@ from pages import Page, in_browser
 from PIL import Image
 
 from rimlight import scenes
-from rimlight.edge_sampling.exr import read_exr
+from rimlight.exr import read_exr
 from rimlight.inverse import fitting, page, problem, report
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from test_freezing import STEPS, Step, assert_same, losses_and_gradients, numbers
 
-from rimlight.edge_sampling import Motion, derivative_image, finite_differences, mean_and_error, z_scores
-from rimlight.edge_sampling.exr import read_exr, read_layers, write_exr, write_layers
+from rimlight.checks import Motion, derivative_image, finite_differences, mean_and_error, z_scores
+from rimlight.exr import read_exr, read_layers, write_exr, write_layers
 
 
 def rig(**options) -> mi.Integrator:

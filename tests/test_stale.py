@@ -11,7 +11,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight.edge_sampling import Motion, derivative_image, find_welded_edges
+from rimlight.checks import Motion, derivative_image
+from rimlight.edge_sampling import find_welded_edges
 
 KINDS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": cases.prb_edge(3), "rig": {"type": "rig"}}
 

@@ -26,18 +26,8 @@ import numpy as np
 import pytest
 
 from rimlight import merl_tables
-from rimlight.edge_sampling import (
-    EdgeKind,
-    FiniteDifferences,
-    Geometry,
-    Motion,
-    derivative_image,
-    find_edges,
-    finite_differences,
-    jumping_textures,
-    mean_and_error,
-    z_scores,
-)
+from rimlight.checks import FiniteDifferences, Motion, derivative_image, finite_differences, mean_and_error, z_scores
+from rimlight.edge_sampling import EdgeKind, Geometry, find_edges, jumping_textures
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "support.md"
 WORDS = ("exact", "warned", "refused", "silent", "untested", "—")

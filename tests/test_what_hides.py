@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight.edge_sampling import Motion, derivative_image
+from rimlight.checks import Motion, derivative_image
 
 SIDEWAYS = {"key": "blocker.vertex_positions", "direction": [1, 0, 0]}
 

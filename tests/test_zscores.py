@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rimlight.edge_sampling import mean_and_error, z_scores
+from rimlight.checks import mean_and_error, z_scores
 
 
 @pytest.fixture

@@ -244,7 +244,7 @@ def write(folder: Path, data: Dataset) -> None:
     ------
     OSError
     """
-    from rimlight.edge_sampling.exr import write_exr
+    from rimlight.exr import write_exr
 
     folder.mkdir(parents=True, exist_ok=True)
     names = [Path(name).stem + ".exr" for name in data.names or [f"{k + 1:03d}" for k in range(len(data.lights))]]

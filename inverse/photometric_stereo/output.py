@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import rimlight
 from rimlight import ggx
-from rimlight.edge_sampling.exr import replacing, write_exr
+from rimlight.exr import replacing, write_exr
 from rimlight.inverse import page
 
 from .direct import bsdf_of, own

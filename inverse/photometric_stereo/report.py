@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from rimlight import pictures
-from rimlight.edge_sampling.exr import replacing
+from rimlight.exr import replacing
 from rimlight.inverse import page
 from rimlight.inverse.page import number
 from rimlight.sys_info import processor

@@ -14,7 +14,7 @@ from scipy import ndimage
 from tqdm import tqdm
 
 from rimlight import ggx, no_collection
-from rimlight.edge_sampling.exr import write_exr
+from rimlight.exr import write_exr
 from rimlight.leds import Led, emitters
 from rimlight.loading import one_line
 

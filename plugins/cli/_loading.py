@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling import Motion
+from rimlight.checks import Motion
 from rimlight.loading import InputError, expected
 
 # ------------------------------------------------------------------ parameters

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from rimlight.edge_sampling.exr import read_exr
+from rimlight.exr import read_exr
 from rimlight.inverse.photometric_stereo import calibration, dataset, output, reconstruction, report, simulation
 from rimlight.loading import InputError, expected, use_variant
 

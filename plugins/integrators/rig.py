@@ -90,7 +90,7 @@ class RigIntegrator(EdgeIntegrator):
     density 0 stay black. Images and derivatives stay right in the mean. For the box filter only.
 
     **Names.** :monosp:`integrator.light_names(scene)` lists the names of the layers, and
-    :monosp:`rimlight.edge_sampling.exr` has :monosp:`write_layers` and :monosp:`read_layers` for OpenEXR files with
+    :monosp:`rimlight.exr` has :monosp:`write_layers` and :monosp:`read_layers` for OpenEXR files with
     named layers.
 
     **Limits.** Those of ``prb_edge``. In light of lamps with a size, coarse smooth-shaded meshes are off by some

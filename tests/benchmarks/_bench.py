@@ -31,8 +31,8 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 
-from rimlight.edge_sampling import FiniteDifferences, Motion, derivative_image  # noqa: E402
-from rimlight.edge_sampling.finite_differences import render_stratified  # noqa: E402
+from rimlight.checks import FiniteDifferences, Motion, derivative_image  # noqa: E402
+from rimlight.checks.finite_differences import render_stratified  # noqa: E402
 
 DIFFERENCES = "finite differences"
 

@@ -1,12 +1,14 @@
-"""Make the references of the derivative tests:  python tests/references/make.py [--missing | NAME ...]
+"""Make the references of the derivative tests:  python tests/references/make.py [--missing | --noise | NAME ...]
 
 Central differences of `path` at 32 × 32, common random numbers, 12 runs of 16,384 stratified samples a pixel, or other
 numbers (`Case.runs`, `Case.reference_spp`): about 20 s each on two cores, minutes for paths of many bounces.
+`--noise` measures the noise of the derivatives themselves, which the tests do not let grow.
 """
 
 from __future__ import annotations
 
 import gc
+import json
 import sys
 import time
 from pathlib import Path
@@ -17,13 +19,26 @@ import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling import Motion, finite_differences
+from rimlight.checks import FiniteDifferences, Motion, compare, finite_differences
+
+
+def measure_noise() -> None:
+    import cases
+
+    noise = json.loads(cases.NOISE.read_text()) if cases.NOISE.exists() else {}
+    for c in cases.CASES:
+        if not (c.needs and not c.needs.exists()):
+            noise[c.name] = round(compare(c.derivatives(), FiniteDifferences.read(c.reference)).own_noise, 5)
+            gc.collect()
+    cases.NOISE.write_text(json.dumps(noise, indent=1) + "\n")
 
 
 def main(names: list[str]) -> None:
     mi.set_variant("llvm_ad_rgb")
     from cases import CASES
 
+    if names == ["--noise"]:
+        return measure_noise()
     wanted = [
         c
         for c in CASES

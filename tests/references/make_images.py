@@ -10,8 +10,8 @@ import rimlight.scenes  # isort: skip (first: it chooses the LLVM library)
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.exr import write_exr
-from rimlight.edge_sampling.finite_differences import render_stratified
+from rimlight.checks.finite_differences import render_stratified
+from rimlight.exr import write_exr
 
 RES, RUNS, SPP = 32, 32, 4096
 

@@ -12,8 +12,8 @@ import numpy as np
 from tqdm import tqdm
 
 from rimlight._collection import no_collection
+from rimlight.exr import read_exr, write_exr
 
-from .exr import read_exr, write_exr
 from .motion import Motion
 
 #: Samples per pixel that are added up in single precision.
