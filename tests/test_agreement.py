@@ -51,7 +51,7 @@ def test_a_factor_shows(factor):
 
 def test_what_is_missing_where_the_derivative_is_small_shows():
     g = truth()
-    g[18:30, 8:24] = 0
+    g[8:24, 18:30] = 0
     found = agreement(g, 0.01)
     assert abs(found.scale - 1) < 0.005
     assert any("4 × 4 pixels" in fault for fault in found.faults())
