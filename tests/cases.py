@@ -4,7 +4,8 @@ references."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from random_scenes import ball
 
-from rimlight.checks import Motion, derivative_image
+from rimlight.checks import FiniteDifferences, Motion, derivative_image, finite_differences
 
 REFERENCES = Path(__file__).parent / "references"
 NOISE = REFERENCES / "noise.json"
@@ -64,6 +65,22 @@ class Case:
         integrator = mi.load_dict(self.integrator)
         images = [derivative_image(scene, integrator, motion, spp=more * self.spp, seed=i) for i in range(self.seeds)]
         return np.array(images, np.float64)
+
+
+def stored_differences(
+    name: str, of: Sequence[str], scene: mi.Scene, motion: Any, runs: int, **options: Any
+) -> FiniteDifferences:
+    """Finite differences that are made once, by `RENEW_REFERENCES=1 python -m pytest ...`, and then read.
+
+    of : what they are of, in words that must not have changed since. runs, options : of `finite_differences`.
+    """
+    file = REFERENCES / f"{name}.exr"
+    of = json.dumps([*of, sorted(" ".join(str(o).split()) for o in options.items())])
+    if os.environ.get("RENEW_REFERENCES"):
+        finite_differences(scene, motion, runs=runs, **options).write(file, {"of": of})
+    found = FiniteDifferences.read(file)
+    assert found.settings["of"] == of, f"{file.name} is of something else: make it anew, with RENEW_REFERENCES=1"
+    return found
 
 
 @contextmanager

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from random_scenes import ball
 
-from rimlight.checks import Motion, derivative_image, finite_differences
+from rimlight.checks import Motion, compare, derivative_image
+
+#: The largest noise of a derivative, relative to its L1 norm.
+NOISE = 0.1
 
 
 def bumps() -> dict:
@@ -48,7 +51,7 @@ def glowing_ball(rings: int, kind: str, bsdf: dict, flipped: bool = False) -> mi
 )
 def test_outlines_count_once(rings, kind, bumpy):
     """The horizon of the normals is 10⁻⁴ of the ball from its outline, often less than the rays look aside."""
-    compare(glowing_ball(rings, kind, bumps() if bumpy else cases.diffuse(0)))
+    assert_exact(f"fine_ball_{kind}", glowing_ball(rings, kind, bumps() if bumpy else cases.diffuse(0)))
 
 
 @pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside a smooth mesh that moves, too"])
@@ -60,12 +63,12 @@ def test_glass(beside):
     points, _, _, faces = ball(12)
     smooth = cases.mesh("ball", 0.5 * points + [0.9, 0, 0], faces, normals=True, bsdf=cases.diffuse(0.5))
     sensor = cases.camera((0, 1, -5), fov=35, film=cases.film(width=16, height=16, pixel_format="luminance"))
-    compare(cases.scene(sensor=sensor, lamp=lamp, ball=smooth, sky=cases.constant()), beside)
+    assert_exact("rough_glass", cases.scene(sensor=sensor, lamp=lamp, ball=smooth, sky=cases.constant()), beside)
 
 
 def test_flipped_normals():
     """Of a coarse ball, whose horizon is well inside of its outline."""
-    compare(glowing_ball(6, "perspective", cases.diffuse(0), flipped=True))
+    assert_exact("flipped_normals", glowing_ball(6, "perspective", cases.diffuse(0), flipped=True))
 
 
 @pytest.mark.parametrize("kind", ["direct_edge", "prb_edge"])
@@ -85,7 +88,7 @@ def test_light_of_coarse_lamps_backward(kind):
     assert backward == pytest.approx(forward, rel=2e-3)
 
 
-def compare(scene: mi.Scene, ball_too: bool = False) -> None:
+def assert_exact(name: str, scene: mi.Scene, ball_too: bool = False) -> None:
     """Does the derivative of a lamp that is shifted agree with finite differences?
 
     ball_too : let the vertices of the ball carry a gradient, but stand still.
@@ -96,11 +99,11 @@ def compare(scene: mi.Scene, ball_too: bool = False) -> None:
         params.update()
     motion = Motion(scene, "lamp.vertex_positions", direction=[1, 0.3, 0.2])
     path = mi.load_dict({"type": "path", "max_depth": 2})
-    reference = finite_differences(scene, motion, step=2e-3, runs=8, spp=4096, integrator=path)
+    reference = cases.stored_differences(
+        name, [str(motion)], scene, motion, step=2e-3, runs=16, spp=4096, integrator=path
+    )
     integrator = mi.load_dict({"type": "direct_edge"})
-    images = [np.array(derivative_image(scene, integrator, motion, spp=1024, seed=i)) for i in range(8)]
-    scales = [(image * reference.mean).sum() / (reference.mean**2).sum() for image in images]
-    error = np.std(scales, ddof=1) / np.sqrt(len(scales))
-    noise = np.sqrt((reference.standard_error**2 * reference.mean**2).sum()) / (reference.mean**2).sum()
-    print(f"{np.mean(scales):.4f} ± {error:.4f} ± {noise:.4f}")
-    assert abs(np.mean(scales) - 1) <= 0.01 + 3 * np.hypot(error, noise)
+    images = [derivative_image(scene, integrator, motion, spp=512, seed=i) for i in range(16)]
+    agreement = compare(np.array(images, np.float64), reference)
+    print(agreement)
+    assert not agreement.faults(noise=NOISE)

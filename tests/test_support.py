@@ -8,8 +8,6 @@ To add a row: a line in the document, and an entry in `CELLS`, `MESSAGES` or `EL
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import struct
 import zlib
@@ -32,7 +30,6 @@ from rimlight.checks import (
     Motion,
     compare,
     derivative_image,
-    finite_differences,
     mean_and_error,
     z_scores,
 )
@@ -50,14 +47,7 @@ CHART_NOISE = 0.15
 
 
 def reference(name: str, of: Sequence[str], scene: mi.Scene, motion: Any, **options: Any) -> FiniteDifferences:
-    """Stored finite differences. of : what they are of, in words that must not have changed since."""
-    file = cases.REFERENCES / f"support_{name}.exr"
-    of = json.dumps([*of, sorted(map(str, options.items()))])
-    if os.environ.get("RENEW_REFERENCES"):
-        finite_differences(scene, motion, runs=6, **options).write(file, {"of": of})
-    found = FiniteDifferences.read(file)
-    assert found.settings["of"] == of, f"{file.name} is of something else: make it anew, see above"
-    return found
+    return cases.stored_differences(f"support_{name}", of, scene, motion, runs=6, **options)
 
 
 def runs_of(scene: mi.Scene, motion: Any, runs: int, spp: int) -> np.ndarray:
