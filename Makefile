@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: setup demo test test-full bench docs lint clean
+.PHONY: setup demo test test-full mutants bench docs lint clean
 
 setup: $(STAMP)
 
@@ -28,6 +28,10 @@ test: setup
 SCENES ?= 300
 test-full: setup
 	RIMLIGHT_SCENES=$(SCENES) $(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
+
+# Deliberate faults, one at a time: which tests notice each?
+mutants: setup
+	$(BIN)/python tests/mutants.py
 
 # All of them take about three quarters of an hour; or one: make bench NAME=scaling
 NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illumination scaling rig integration reflectance photometric_stereo single_image

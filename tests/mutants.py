@@ -1,0 +1,233 @@
+"""Deliberate faults, one at a time, and which tests notice each:  python tests/mutants.py [--only NUMBER ...] [TEST]
+
+A test that cannot fail proves nothing. Each fault is made in a copy of the project, never in the project itself. The
+tests stop at the third that fails; what no test notices is listed at the end, with exit code 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Where `rimlight` and its parts come from.
+PACKAGES = {"plugins": "", "edge_sampling": "edge_sampling", "inverse": "inverse", "scenes": "scenes"}
+
+TESTS = ("derivatives", "coarse_meshes", "fine_meshes", "stale", "direct_edge", "prb_edge", "random_scenes")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """fault : in words. file : of the project. changes : (text, what takes its place), each occurs once."""
+
+    fault: str
+    file: str
+    changes: tuple[tuple[str, str], ...]
+
+
+def mutant(fault: str, file: str, *texts: str) -> Mutant:
+    return Mutant(fault, file, tuple(zip(texts[::2], texts[1::2], strict=True)))
+
+
+INTEGRATOR = "plugins/integrators/_edge_integrator.py"
+SCATTERING = "plugins/integrators/_scattering.py"
+FILM = "edge_sampling/film_boundary.py"
+SHADOWS = "edge_sampling/shadow_boundary.py"
+SHADING = "edge_sampling/shading_boundary.py"
+
+MUTANTS = [
+    # ---------------------- A term, 2 % too large ----------------------
+    mutant(
+        "interior: 2 % too large",
+        INTEGRATOR,
+        "value = Sample(mi.Spectrum(L * ray_weight), mi.Float(0))",
+        "value = Sample(mi.Spectrum(1.02 * L * ray_weight), mi.Float(0))",
+    ),
+    mutant(
+        "film boundary: 2 % too large",
+        FILM,
+        "normal_velocity = dr.dot(points.n_dl, points.velocity)",
+        "normal_velocity = 1.02 * dr.dot(points.n_dl, points.velocity)",
+    ),
+    mutant("shadows from lights: 2 % too large", SHADOWS, "value = jump * dr.dot", "value = 1.02 * jump * dr.dot"),
+    mutant("edges from points: 2 % too large", SHADING, "return -side * L", "return -1.02 * side * L"),
+    mutant(
+        "planes of faces: twice as large",
+        "edge_sampling/face_planes.py",
+        "value += jump * dr.select",
+        "value += 2 * jump * dr.select",
+    ),
+    mutant(
+        "edges from points: density of candidates 2 % off",
+        SHADING,
+        "e.density *= dr.select(emission,",
+        "e.density *= 1.02 * dr.select(emission,",
+    ),
+    # ---------------------- Signs, sides, velocities ----------------------
+    mutant("film boundary: wrong sign", FILM, "jump -= sign * L * weight", "jump += sign * L * weight"),
+    mutant(
+        "edges from points: velocity of what is seen left out",
+        SHADING,
+        " - _turning(n_dl, y - x, valid)",
+        "",
+    ),
+    mutant(
+        "shadows from lights: motion of the light not followed",
+        SHADOWS,
+        "q = dr.select(on_surface, on_light.p, q)",
+        "q = dr.select(on_surface, dr.detach(on_light.p), q)",
+    ),
+    mutant(
+        "interior: change of area left out",
+        SCATTERING,
+        "if self.moving:\n            geometry",
+        "if False:\n            geometry",
+    ),
+    mutant(
+        "interior: rotation of the environment left out",
+        SCATTERING,
+        "attached = dr.select(on_surface, attached, elsewhere)",
+        "attached = dr.select(on_surface, attached, dr.detach(elsewhere))",
+    ),
+    mutant(
+        "interior: background stands still when the camera turns",
+        SCATTERING,
+        "return active & si.is_valid() & ~si.shape.is_mesh() & (dr.abs_dot",
+        "return active & ~si.shape.is_mesh() & (dr.abs_dot",
+    ),
+    mutant(
+        "path replay: one vertex short",
+        "plugins/integrators/_paths.py",
+        "active = self.active & vertex.pi.is_valid() & depths.scatters(vertex.depth)",
+        "active = self.active & vertex.pi.is_valid() & depths.scatters(vertex.depth + 1)",
+    ),
+    # ---------------------- Which edges there are ----------------------
+    mutant(
+        "edges: not welded",
+        "edge_sampling/edges.py",
+        "weld = _weld_equal(point)",
+        "weld = np.arange(len(point))",
+        "rewelded, tolerance = _weld_close(point, weld, face, sides)",
+        "rewelded, tolerance = weld, 0.0",
+    ),
+    mutant(
+        "edges: creases dropped",
+        "edge_sampling/edges.py",
+        "kind[~interpolated[mesh0]] = EdgeKind.FLAT",
+        "kind[~interpolated[mesh0]] = EdgeKind.SMOOTH",
+    ),
+    mutant(
+        "shadows from lights: only the first light",
+        SHADOWS,
+        "if throws_shadows(emitters[i])])",
+        "if throws_shadows(emitters[i])][:1])",
+    ),
+    mutant("tree of edges: not refitted", INTEGRATOR, "boundaries.silhouettes.refit()", "pass"),
+    mutant("edges: never found again", INTEGRATOR, "        if same:\n", "        if self._sources is not None:\n"),
+    mutant(
+        "film boundary: folds hidden by their own mesh count",
+        FILM,
+        "active &= ~(is_edge & self.edges.is_hidden_fold(positions, edge, p, rays, *hides))",
+        "pass",
+    ),
+    mutant(
+        "film boundary: no horizons of interpolated normals",
+        FILM,
+        "self.horizons = horizons if len(horizons) else None",
+        "self.horizons = None",
+    ),
+    # ---------------------- Details ----------------------
+    mutant(
+        "film: samples of the boundary weigh in the filter",
+        INTEGRATOR,
+        "return Term(part.to_film(s.position), value, s.wavelengths, 0.0, 0)\n\n    def _shadows",
+        "return Term(part.to_film(s.position), value, s.wavelengths, 1.0, 0)\n\n    def _shadows",
+    ),
+    mutant(
+        "film boundary: cuts of the near plane stand still",
+        FILM,
+        "t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)",
+        "t = dr.detach(depth[0] / dr.select(crossed, depth[0] - depth[k], 1))",
+    ),
+    mutant("film boundary: looks 100 times as far aside", FILM, "in_world = 8 * ulp", "in_world = 800 * ulp"),
+    mutant(
+        "edges from points: not shared with the lights' samples",
+        SHADING,
+        "L *= dr.select(shared, mis, 1)",
+        "pass",
+    ),
+    mutant(
+        "interior: a lamp lights itself in its own plane",
+        SCATTERING,
+        "return height <= FLUSH * dr.epsilon(mi.Float) * scale",
+        "return height < 0",
+    ),
+]
+
+
+def copy_of_project(folder: Path) -> None:
+    ignore = shutil.ignore_patterns("__pycache__", ".pytest_cache")
+    for source, target in PACKAGES.items():
+        shutil.copytree(ROOT / source, folder / "rimlight" / target, ignore=ignore, dirs_exist_ok=True)
+    shutil.copytree(ROOT / "tests", folder / "tests", ignore=ignore)
+    shutil.copy(ROOT / "pyproject.toml", folder)
+
+
+def apply(m: Mutant, folder: Path) -> None:
+    package, _, rest = m.file.partition("/")
+    file = folder / "rimlight" / PACKAGES[package] / rest
+    text = file.read_text()
+    for old, new in m.changes:
+        if text.count(old) != 1:
+            raise SystemExit(f"{m.fault}: {m.file} has {text.count(old)} times: {old}")
+        text = text.replace(old, new)
+    file.write_text(text)
+
+
+def failures(m: Mutant, tests: list[str]) -> list[str]:
+    """Names of the first tests that fail with it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        copy_of_project(folder)
+        apply(m, folder)
+        command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--maxfail", "3", "-p", "no:cacheprovider", *tests]
+        # Found before the project that is installed.
+        environment = {**os.environ, "PYTHONPATH": str(folder)}
+        run = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        if run.returncode not in (0, 1, 2):
+            raise SystemExit(f"{m.fault}: the tests did not run\n{run.stdout[-2000:]}{run.stderr[-2000:]}")
+        return re.findall(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.M)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tests", nargs="*", default=[f"tests/test_{name}.py" for name in TESTS], metavar="TEST")
+    parser.add_argument("--only", type=int, nargs="*", metavar="NUMBER", help="these faults, counted from 0")
+    parser.add_argument("--list", action="store_true", help="the faults")
+    options = parser.parse_args()
+    missed = []
+    for k, m in enumerate(MUTANTS):
+        if options.only is not None and k not in options.only:
+            continue
+        if options.list:
+            print(f"{k:3d} {m.fault}")
+            continue
+        found = failures(m, options.tests)
+        caught = ", ".join(re.sub(r".*test_(\w+)\.py::", r"\1: ", name) for name in found)
+        print(f"{k:3d} {m.fault:60s} {caught or 'NOT NOTICED'}", flush=True)
+        missed += [] if found else [m.fault]
+    if missed:
+        print(f"Not noticed: {'; '.join(missed)}")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
