@@ -28,10 +28,11 @@ class Agreement:
     zero : is the reference 0 within its noise, so that there is no `scale`?
     scale, scale_error : the projection ⟨g, r⟩ / ⟨r, r⟩ with its standard error; 1 is right. Neither the noise of g nor
         that of r biases it.
-    relative : Σ |g − r| / Σ |r|. noise : what noise alone would make of it.
+    relative : the sum of absolute differences, relative to that of absolute values of r.
+    noise : what noise alone would make of `relative`.
     own_noise : what the noise of g alone would make of it.
-    square : the largest |z| of sums over squares of 4 × 4 pixels, beyond a tolerance.
-    pixel : the largest |z| of a value.
+    square : the largest absolute z of sums over squares of 4 × 4 pixels, beyond a tolerance.
+    pixel : the largest absolute z of a value.
     mean_z2 : mean of z² over the values that are not 0.
     runs : of g.
     squares, pixels : how many there are.
