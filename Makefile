@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: setup demo test test-full mutants bench docs lint clean
+.PHONY: setup demo test test-fast test-full mutants bench docs lint clean
 
 setup: $(STAMP)
 
@@ -24,10 +24,14 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
 
-# The same, with random ordinary scenes: 300 take about an hour, or as many as: make test-full SCENES=1000
+# A minute's worth of them
+test-fast: setup
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m fast
+
+# With many samples, and random ordinary scenes: 300 take about an hour, or as many as: make test-full SCENES=1000
 SCENES ?= 300
 test-full: setup
-	RIMLIGHT_SCENES=$(SCENES) $(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
+	RIMLIGHT_FULL=1 RIMLIGHT_SCENES=$(SCENES) $(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
 
 # Deliberate faults, one at a time: which tests notice each?
 mutants: setup

@@ -58,12 +58,13 @@ class Case:
     def reference(self) -> Path:
         return REFERENCES / f"{self.name}.exr"
 
-    def derivatives(self, more: int = 1) -> np.ndarray:
-        """One image for each seed, with `more` times the samples: (seeds, H, W, C)."""
+    def derivatives(self, least: int = 0) -> np.ndarray:
+        """One image for each seed, with at least so many samples per pixel: (seeds, H, W, C)."""
         scene = self.scene()
         motion = Motion(scene, **self.motion)
         integrator = mi.load_dict(self.integrator)
-        images = [derivative_image(scene, integrator, motion, spp=more * self.spp, seed=i) for i in range(self.seeds)]
+        spp = max(least, self.spp)
+        images = [derivative_image(scene, integrator, motion, spp=spp, seed=i) for i in range(self.seeds)]
         return np.array(images, np.float64)
 
 

@@ -129,7 +129,8 @@ def compare(derivatives: np.ndarray, reference: FiniteDifferences, *, tolerance:
     allowed = tolerance * _squares(np.abs(r))
     theirs_error = np.sqrt(_squares(r_error**2))
     beyond = np.maximum(np.abs(sums - _squares(r)) - allowed, 0)
-    squares = z_scores(beyond, sums_error, np.zeros_like(beyond), theirs_error, 1e-3 * np.abs(_squares(r)).max())
+    bias = np.hypot(1e-3 * np.abs(_squares(r)).max(), np.sqrt(_squares(step_error**2)))
+    squares = z_scores(beyond, sums_error, np.zeros_like(beyond), theirs_error, bias)
     return Agreement(
         finite=bool(np.isfinite(runs).all()),
         zero=bool(zero),
