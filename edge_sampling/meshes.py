@@ -129,10 +129,12 @@ def bent_faces(mesh: Any) -> mi.Bool:
     face = 3 * dr.arange(mi.UInt32, mesh.face_count())
     vertices = [dr.gather(mi.UInt32, mesh.faces_buffer(), face + k) for k in range(3)]
     a, b, c = (dr.gather(mi.Point3f, p, v) for v in vertices)
-    own = dr.normalize(dr.cross(b - a, c - a))
+    own = dr.cross(b - a, c - a)
     bent = mi.Bool(False)
     for v in vertices:
-        bent |= dr.norm(dr.cross(dr.gather(mi.Normal3f, n, v), own)) > BENT
+        # Normals need not have the length 1. Those that are not finite are bent; faces without area are not.
+        normal = dr.gather(mi.Normal3f, n, v)
+        bent |= ~(dr.norm(dr.cross(normal, own)) <= BENT * dr.norm(normal) * dr.norm(own))
     return bent
 
 

@@ -38,6 +38,21 @@ def test_noise_alone_passes(noise):
     assert 0.4 * errors.mean() < scales.std() < 1.5 * errors.mean()
 
 
+def test_few_pixels_pass():
+    """Of which the means vary more."""
+    mean = np.zeros((16, 16, 3))
+    mean[3, 4:7] = [1, 2, 3]
+    noise = 0.1 * (mean != 0)
+    found = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        images = mean + noise * rng.normal(size=(RUNS, 16, 16, 1))  # channels share their noise
+        exact = FiniteDifferences(mean, 0 * mean, 0 * mean, {})
+        found.append(compare(images, exact))
+    assert sum(bool(a.faults()) for a in found) <= 1
+    assert compare(1.2 * images, exact).faults()
+
+
 def test_a_noisy_reference_does_not_look_larger():
     found = [compare(runs(truth(), 0.01, 1 + seed), reference(truth(), 3, 100 + seed)) for seed in range(20)]
     scales, errors = np.array([(a.scale, a.scale_error) for a in found]).T
@@ -75,10 +90,19 @@ def test_noise_has_an_upper_limit():
     assert "noise" in found.faults(noise=0.5 * found.own_noise)[0]
 
 
-def test_what_is_not_finite_fails():
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_fails(value):
     found = runs(truth(), 0.1, 1)
-    found[3, 2, 1, 0] = np.nan
+    found[3, 2, 1, 0] = value
     assert compare(found, reference(truth(), 0.1, 0)).faults() == ["it is not finite"]
+
+
+def test_reference_that_is_not_finite():
+    """Not even to be compared with: whatever is compared with NaN is false."""
+    wrong = reference(truth(), 0.1, 0)
+    wrong.mean[3, 2, 1] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        compare(runs(truth(), 0.1, 1), wrong)
 
 
 def test_zero():

@@ -10,6 +10,7 @@ import pytest
 from random_scenes import ball
 
 from rimlight.checks import Motion, compare, derivative_image
+from rimlight.edge_sampling.meshes import is_smooth
 
 #: The largest noise of a derivative, relative to its L1 norm.
 NOISE = 0.1
@@ -93,3 +94,12 @@ def test_backward(name):
     image = mi.render(scene, motion.params, integrator=integrator, spp=64, seed=2, seed_grad=1)
     dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
     assert np.array(dr.grad(θ))[0] == pytest.approx(forward, rel=2e-3)
+
+
+@pytest.mark.parametrize("length", [1e-4, 1e4])
+def test_normals_of_any_length_are_interpolated(length):
+    (ball,) = (s for s in coarse_ball().shapes() if s.is_mesh())
+    params = mi.traverse(ball)
+    params["vertex_normals"] = length * params["vertex_normals"]
+    params.update()
+    assert is_smooth(ball)

@@ -24,4 +24,5 @@ def test_agrees_with_finite_differences(case):
         pytest.skip(f"needs {case.needs}")
     agreement = compare(case.derivatives(LEAST), FiniteDifferences.read(case.reference))
     print(f"{case.name}: {agreement}")
+    assert not agreement.zero
     assert not agreement.faults(noise=MORE_NOISE * json.loads(cases.NOISE.read_text())[case.name])

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
