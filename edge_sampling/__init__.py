@@ -1,21 +1,22 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
-from .batch import Batch, FilmPart, film_parts
-from .edge_importance import Cone, EdgeSample, Lobe, View, resample, sample_edge, stratified
-from .edge_tree import EdgeTree
-from .edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
-from .face_planes import FacePlanes
-from .film_boundary import BoundarySamples, FilmBoundary
-from .horizon import Horizon, Horizons
-from .intersections import intersecting_meshes, t_junctions
+from .boundaries.face_planes import FacePlanes
+from .boundaries.film_boundary import BoundarySamples, FilmBoundary
+from .boundaries.horizon import Horizon, Horizons
+from .boundaries.shading_boundary import ShadingBoundary
+from .boundaries.shadow_boundary import ShadowBoundary, ShadowSamples
+from .choice.edge_tree import EdgeTree
+from .choice.sampling import EdgeSample, resample, sample_edge, stratified
+from .choice.silhouettes import Silhouettes
+from .choice.views import Cone, Lobe, View
+from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
+from .geometry.intersections import intersecting_meshes, t_junctions
+from .geometry.meshes import Geometry, jumping_textures, objects_below
+from .geometry.sources import Sources
 from .lights import Lights, has_hard_beam
-from .meshes import Geometry, jumping_textures, objects_below
-from .projection import Projection
-from .shading_boundary import ShadingBoundary
-from .shadow_boundary import ShadowBoundary, ShadowSamples
-from .silhouettes import Silhouettes
+from .projection.film_parts import Batch, FilmPart, film_parts
+from .projection.sensors import Projection
 from .smooth_lamps import SmoothLamps
-from .sources import Sources
 
 __all__ = [
     "Batch",

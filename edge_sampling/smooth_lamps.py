@@ -15,7 +15,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .meshes import has_interpolated_normals
+from .geometry.meshes import has_interpolated_normals
 
 
 class SmoothLamps:

@@ -10,7 +10,7 @@ import pytest
 from random_scenes import ball
 
 from rimlight.checks import Motion, compare, derivative_image
-from rimlight.edge_sampling.meshes import is_smooth
+from rimlight.edge_sampling.geometry.meshes import is_smooth
 
 #: The largest noise of a derivative, relative to its L1 norm.
 NOISE = 0.1

@@ -13,8 +13,9 @@ from scipy.spatial import ConvexHull
 from scipy.stats import chisquare
 
 from rimlight.edge_sampling import Edges, Geometry, find_edges
-from rimlight.edge_sampling.edge_importance import Cone, Lobe, View, resample, sample_edge
-from rimlight.edge_sampling.edge_tree import LEAF, EdgeTree
+from rimlight.edge_sampling.choice.edge_tree import LEAF, EdgeTree
+from rimlight.edge_sampling.choice.sampling import resample, sample_edge
+from rimlight.edge_sampling.choice.views import Cone, Lobe, View
 
 # ---------------------- Meshes and trees ----------------------
 

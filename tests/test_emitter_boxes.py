@@ -10,7 +10,7 @@ import pytest
 
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import Geometry
-from rimlight.edge_sampling.emitter_boxes import EmitterBoxes
+from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
 
 LIGHTS = {
     "quad": lambda: cases.horizontal((0.3, 2, 0.1), 0.4, "light", down=True, emitter=cases.light(1, 1, 1)),

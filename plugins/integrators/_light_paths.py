@@ -15,11 +15,12 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling import Horizon, Lights
+from rimlight.edge_sampling.boundaries.horizon import turn_to_side
+from rimlight.edge_sampling.parametrisation import look_from, material_point, seen_by_camera
+from rimlight.transport import CutRays, PathTracer, Scattering, Vertex
+from rimlight.transport.paths import step
 
-from ._cut_rays import CutRays
 from ._layers import Layers
-from ._paths import Depths, Vertex, step
-from ._scattering import Scattering, met_by, turn_to_side
 
 #: Light samples of one vertex differ by these, modulo 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom
 #: sequences", R2). By itself, each is uniform.
@@ -108,15 +109,17 @@ class Place:
     def surface(self, scattering: Scattering, active) -> mi.SurfaceInteraction3f:
         """The surface there; attached, if `scattering` is, to a ray that is fixed on the film, and from the second
         vertex on to the material point."""
-        follow = lambda number: mi.RayFlags.FollowShape if number > 1 else mi.RayFlags.Empty
-        flags = mi.RayFlags.All | follow(self.number)
-        si = met_by(self.ray, self.pi, flags, active, scattering.attached)
+
+        def surface(number, ray, pi):
+            if number == 1:
+                return seen_by_camera(ray, pi, active, attached=scattering.attached)
+            with dr.resume_grad(when=scattering.attached):
+                return material_point(ray, pi, active, mi.RayFlags.All)
+
+        si = surface(self.number, self.ray, self.pi)
         with dr.resume_grad(when=scattering.attached):
             if scattering.attached and self.before is not None and scattering.directional:
-                ray, pi = self.before
-                flags = mi.RayFlags.Minimal | follow(self.number - 1)
-                x = pi.compute_surface_interaction(ray, flags, active).p
-                si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
+                look_from(si, surface(self.number - 1, *self.before).p)
         if self.horizon is not None and self.number == 1:
             turn_to_side(si, self.ray, self.horizon)
         return si
@@ -335,20 +338,13 @@ class Backward:
 class LightPaths:
     """Camera paths, and the loops over the lights at their vertices.
 
-    first_hit : maps (scene, ray, active) to what camera rays meet.
+    tracer : tells what camera rays meet, and how long paths are.
+    per_path : see `LightByLight`.
     """
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        lights: Lights,
-        depths: Depths,
-        per_path: int,
-        hide_emitters: bool,
-        first_hit: Callable[..., mi.PreliminaryIntersection3f],
-    ):
-        self.scene, self.lights, self.depths, self.per_path = scene, lights, depths, per_path
-        self.hide_emitters, self.first_hit = hide_emitters, first_hit
+    def __init__(self, tracer: PathTracer, lights: Lights, per_path: int):
+        self.tracer, self.lights, self.per_path = tracer, lights, per_path
+        self.scene, self.depths = tracer.scene, tracer.depths
 
     def trace(
         self,
@@ -376,10 +372,10 @@ class LightPaths:
         with dr.resume_grad(when=to.attached):
             ray = _wide(mi.Ray3f(ray), dr.full(mi.Bool, True, dr.width(u)))
         ray = to.start(ray)
-        pi = self.first_hit(self.scene, ray, active)
+        pi = self.tracer.first_hit(ray, active)
         one, zero = (dr.full(mi.Spectrum, value, dr.width(u)) for value in (1, 0))
         place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, horizon)
-        if area and not self.hide_emitters:
+        if area and not self.tracer.hide_emitters:
             self._seen(to, scattering, place, active)
         active &= pi.is_valid()
         η = mi.Float(1)

@@ -1,7 +1,8 @@
-"""What Mitsuba's materials and lights do that derivatives lack."""
+"""What derivatives lack, in words for the user."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -9,8 +10,18 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._plan import names
-from rimlight.edge_sampling import film_parts, objects_below
-from rimlight.edge_sampling.meshes import faces, has_interpolated_normals, vertices
+from rimlight.edge_sampling import (
+    Edges,
+    Geometry,
+    film_parts,
+    has_hard_beam,
+    intersecting_meshes,
+    jumping_textures,
+    objects_below,
+    t_junctions,
+)
+from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, vertices
+from rimlight.transport import Depths
 
 #: What perfect mirrors and glass do.
 MIRRORS = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
@@ -23,6 +34,154 @@ PARTIAL = {
 }
 
 
+@dataclass(frozen=True)
+class Moving:
+    """What moves.
+
+    known : the shapes that can: meshes, then analytic shapes. flags : do they? camera, lights : do these?
+    """
+
+    known: tuple[Any, ...]
+    flags: tuple[bool, ...]
+    camera: bool
+    lights: bool
+
+    @property
+    def key(self) -> tuple[tuple[bool, ...], bool, bool]:
+        return self.flags, self.camera, self.lights
+
+    @property
+    def anything(self) -> bool:
+        return self.camera or self.lights or any(self.flags)
+
+    @property
+    def shapes(self) -> tuple[Any, ...]:
+        """Those of the known shapes that move."""
+        return tuple(s for s, moves in zip(self.known, self.flags, strict=True) if moves)
+
+    @property
+    def on_film(self) -> tuple[Any, ...]:
+        """Those that move as seen from the camera."""
+        return self.known if self.camera else self.shapes
+
+
+def lasting_limits(
+    scene: mi.Scene,
+    geometry: Geometry,
+    edges: Edges,
+    depths: Depths,
+    moving: Moving,
+    sppi: int,
+    *,
+    planes: bool,
+    from_points: bool,
+) -> tuple[str, ...]:
+    """What the derivative will lack as long as the edges stay what they are. planes, from_points : see
+    `BoundarySearch`."""
+    limits = []
+    if sppi:
+        limits += reflected_light(scene, geometry, depths, from_points=from_points)
+        if depths.scatters(1):
+            limits += coarse_lamps(scene) + small_scene(scene)
+            limits += [] if planes else coarse_meshes(scene)
+    return (*limits, *appearance(scene, moving), *outlines(scene, geometry, edges, moving))
+
+
+def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool) -> list[str]:
+    """What lacks of the light that surfaces reflect."""
+    limits = []
+    if from_points:
+        delta = any(
+            e.flags() & mi.EmitterFlags.Delta or (hasattr(e, "light_count") and dr.any(e.angular_radius == 0))
+            for e in scene.emitters()
+        )
+        if delta and depths.scatters(2):
+            limits.append(
+                "the derivative has the hard shadows of lights without size (point, spot, directional, ...) on what "
+                "the camera sees, but lacks those in indirect light; give the lights a size, or set "
+                '"max_depth" to 2 to leave it out.'
+            )
+    elif depths.scatters(2) or scene.environment() is not None:
+        limits.append(
+            "the derivative has the shadows that lights throw on what the camera sees, but lacks those of the "
+            'environment and all that edges do to indirect light; set "sppi" to 0 to accept this.'
+        )
+    beams = names(e for e in scene.emitters() if has_hard_beam(e))
+    if beams:
+        limits.append(
+            f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below "
+            "its cutoff_angle, and a projector an image with a black border."
+        )
+    if any(is_mirror(s) for s in scene.shapes()):
+        limits.append(
+            "the derivative lacks the motion of what perfect mirrors and glass show; "
+            'give them a roughness, or set "sppi" to 0 to accept this.'
+        )
+    through = names(s for s in scene.shapes() if lets_through(s))
+    if through and depths.scatters(2):
+        limits.append(
+            "the derivative lacks part of the motion of what is seen, and of what shines, through "
+            f"{', '.join(through)}; "
+            'cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
+        )
+    casts = names(s for s in geometry.others if not s.is_emitter())
+    if casts:
+        limits.append(
+            f"the derivative lacks the shadows and reflections of {', '.join(casts)} on what moves, or in moving "
+            "light: their silhouettes are unknown. Replace them by meshes."
+        )
+    return limits
+
+
+def appearance(scene: mi.Scene, moving: Moving) -> list[str]:
+    """What lacks of the jumps inside of surfaces and environments."""
+    limits = []
+    textures = jumping_textures(scene)
+    if textures:
+        limits.append(
+            f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
+            "normal maps for bump maps."
+        )
+    if (moving.camera or moving.lights) and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
+        limits.append(
+            "the derivative lacks the motion of the border of the sun; set the sun_scale of sunsky to 0, and add a "
+            "directional light."
+        )
+    return limits
+
+
+def outlines(scene: mi.Scene, geometry: Geometry, edges: Edges, moving: Moving) -> list[str]:
+    """What lacks, or is counted twice, at the outlines of shapes."""
+    limits = []
+    grids = names(s for s in scene.shapes() if s.class_name() == "SDFGrid")
+    if grids:
+        limits.append(
+            f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid). Replace "
+            "them by meshes."
+        )
+    cut = {
+        (geometry.meshes[i].id(), geometry.meshes[j].id())
+        for i, j in intersecting_meshes(scene, geometry, edges)
+        if moving.flags[i] or moving.flags[j] or moving.camera
+    }
+    if cut:
+        pairs = ", ".join(f'"{a}" and "{b}"' for a, b in sorted(cut))
+        limits.append(f"the derivative lacks the lines in which meshes cut through each other: {pairs}.")
+    # Of edges that lie on one another, those of what stands still have no velocity, and do not count.
+    twice = sorted(
+        (geometry.meshes[i].id(), geometry.meshes[j].id())
+        for i, j in (t_junctions(geometry, edges) if moving.on_film else ())
+        if moving.camera or (moving.flags[i] and moving.flags[j])
+    )
+    if twice:
+        pairs = ", ".join(f'"{a}"' if a == b else f'"{a}" and "{b}"' for a, b in twice)
+        limits.append(
+            "the derivative counts the jump at T-junctions twice, where a vertex lies inside of an open edge: "
+            f"{pairs}. Divide the longer edges there."
+        )
+    return limits
+
+
 def lets_through(shape: mi.Shape) -> bool:
     """Can rays go through the shape as if nothing was there? (Mitsuba's `hair` says so, but they never do.)"""
     bsdf = shape.bsdf()
@@ -32,16 +191,6 @@ def lets_through(shape: mi.Shape) -> bool:
 def is_mirror(shape: mi.Shape) -> bool:
     """Does the shape reflect or refract perfectly?"""
     return shape.bsdf() is not None and bool(shape.bsdf().flags() & MIRRORS)
-
-
-def divides_by_density(bsdf: mi.BSDF) -> bool:
-    """Must the weight f / p of a perfect reflection be multiplied by its attached probability p, over the present p, to
-    have the gradient of f? (In Mitsuba 3.9, the weights of other BSDFs have that already.)"""
-    if not bsdf.flags() & mi.BSDFFlags.Delta:
-        return False
-    if bsdf.class_name() == "TwoSidedBRDF":
-        return any(divides_by_density(b) for b in objects_below(bsdf).values() if isinstance(b, mi.BSDF) and b != bsdf)
-    return bsdf.class_name() in ("SmoothPlastic", "ThinDielectric")
 
 
 class PartialParameters:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ._edge_integrator import EdgeIntegrator
+from .edge_integrator import EdgeIntegrator
 
 
 class DirectEdgeIntegrator(EdgeIntegrator):

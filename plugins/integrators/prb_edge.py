@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ._edge_integrator import EdgeIntegrator
 from ._options import is_whole
+from .edge_integrator import EdgeIntegrator
 
 
 class PRBEdgeIntegrator(EdgeIntegrator):

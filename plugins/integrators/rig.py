@@ -6,19 +6,15 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._collection import no_collection
-from rimlight.edge_sampling import FilmBoundary, FilmPart, Lights, ShadowBoundary, film_parts, stratified
+from rimlight.edge_sampling import FilmPart, Lights, stratified
+from rimlight.terms import Job
+from rimlight.terms.sampling import in_a_row, over_film, seed_of
 
-from ._edge_integrator import HARD_SHADOWS, EdgeIntegrator
 from ._finite import report_gradients, report_image
 from ._layers import Layers, LayerSamples
 from ._light_paths import Backward, Forward, LightPaths, Measure, Splat
-from ._limits import coarse_meshes
 from ._options import is_whole
-
-SHADOWS_ON_FILM = (
-    "the derivative has the shadows that lights throw on what the camera sees, but lacks those of the environment and "
-    'all that edges do to indirect light; set "sppi" to 0 to accept this.'
-)
+from .edge_integrator import EdgeIntegrator
 
 #: Longest path. A derivative keeps all of its vertices in memory.
 LONGEST = 16
@@ -114,7 +110,8 @@ class RigIntegrator(EdgeIntegrator):
     """
 
     OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth", "lights_per_path")
-    SOFT = False
+    PLANES = False
+    FROM_POINTS = False
 
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()
@@ -134,7 +131,7 @@ class RigIntegrator(EdgeIntegrator):
         with dr.suspend_grad():
             sensor = self._sensor(scene, sensor)
             paths = self._paths(scene)
-            sampler, spp = self._sampler(sensor, seed, spp or sensor.sampler().sample_count())
+            sampler, spp = over_film(sensor, seed, spp or sensor.sampler().sample_count())
             ray, weight, u = self.sample_rays(scene, sensor, sampler)
             layers = Layers(sensor.film(), len(paths.lights), u, spp)
             paths.trace(Splat(layers), sampler, ray, u, weight / spp, self._choice(sampler, seed))
@@ -169,46 +166,38 @@ class RigIntegrator(EdgeIntegrator):
     def _differentiate(self, scene, sensor, seed, spp, grad_in) -> Layers:
         """All terms, in forward mode, or given a gradient, in backward mode."""
         forward = grad_in is None
-        sensor = self._sensor(scene, sensor)
-        sppc, sppp, sppi = self._counts(spp, sensor)
-        boundaries = self._boundaries_of(scene, sensor, sppi)
+        job = self.job(scene, sensor, seed, spp)
         paths = self._paths(scene)
-        sampler, spp = self._sampler(sensor, seed, sppc or 16)
-        ray, weight, u = self.sample_rays(scene, sensor, sampler)
-        layers = Layers(sensor.film(), len(paths.lights), u, spp, grad_in)
-        if sppc:
+        sampler, spp = over_film(job.sensor, seed, job.counts.weights)
+        ray, weight, u = job.sample_rays(sampler)
+        layers = Layers(job.sensor.film(), len(paths.lights), u, spp, grad_in)
+        if job.counts.interior:
             to = Forward(layers) if forward else Backward(layers)
             paths.trace(to, sampler, ray, u, dr.detach(weight) / spp, self._choice(sampler, seed))
             if not forward:
                 to.finish()
-        if boundaries.shadows is not None:
-            boundaries.silhouettes.refit()
-        for i, part in enumerate(film_parts(sensor)):
-            part_seed = seed ^ i << 16
-            if boundaries.film is not None and sppp:
-                self._film_boundary(scene, sensor, part, part_seed, sppp, paths, layers, boundaries.film, forward)
-            if boundaries.shadows is not None:
-                samples = self._shadows(scene, sensor, part, part_seed, sppi, boundaries.shadows)
+        job.boundaries.refit()
+        for i, part in enumerate(job.parts):
+            if job.boundaries.film is not None and job.counts.film:
+                self._film_boundary(job, i, part, paths, layers, forward)
+            if job.boundaries.shadows is not None:
+                samples = self._shadows(job, i, part)
                 layers.forward(samples) if forward else layers.backward(samples)
         return layers
 
-    def _shadows(self, scene, sensor, part: FilmPart, seed, sppi, shadows: ShadowBoundary) -> LayerSamples:
+    def _shadows(self, job: Job, i: int, part: FilmPart) -> LayerSamples:
         """Shadows on what the camera sees, on one part of the film; each belongs to one light."""
-        sampler, _ = self._sampler(sensor, 0xAAAAAAAA ^ seed, sppi, part.sensor.film())
-        s = shadows.sample(scene, part.sensor, sampler, self._first_hit, share=False)
+        seed = seed_of("shadows from lights", job.seed, i)
+        sampler, _ = over_film(job.sensor, seed, job.counts.shading, part.sensor.film())
+        s = job.boundaries.shadows.sample(job.tracer, part.sensor, sampler, share=False)
         with dr.resume_grad():
             return LayerSamples(part.to_film(s.position), s.light, s.value * part.area)
 
-    def _film_boundary(
-        self, scene, sensor, part: FilmPart, seed, sppp, paths, layers, boundary: FilmBoundary, forward
-    ) -> None:
+    def _film_boundary(self, job: Job, i: int, part: FilmPart, paths, layers, forward: bool) -> None:
         """Visibility as seen from the sensor, on one part of its film: all lights, on both sides of the edges."""
-        count, seed = self._line_samples(part.sensor, sppp), 0xFFFFFFFF ^ seed
-        sampler = sensor.sampler().clone()
-        sampler.set_sample_count(1)
-        sampler.set_samples_per_wavefront(1)
-        sampler.seed(seed, count)
-        points = boundary.points(scene, part.sensor, sampler, count)
+        count, seed = job.counts.on_line(part.sensor.film()), seed_of("film boundary", job.seed, i)
+        sampler = in_a_row(job.sensor, seed, count)
+        points = job.boundaries.film.points(job.tracer.scene, part.sensor, sampler, count)
         position = part.to_film(points.position)
         with dr.resume_grad():
             normal_velocity = dr.dot(points.n_dl, points.velocity) * part.area
@@ -228,16 +217,6 @@ class RigIntegrator(EdgeIntegrator):
             with dr.resume_grad():
                 normal_velocity = dr.dot(points.n_dl, points.velocity) * part.area
                 dr.backward_from(to.total * normal_velocity, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
-
-    def _light_boundaries(self, *args):
-        shadows, _ = super()._light_boundaries(*args)
-        return shadows, None
-
-    def _limits(self, scene, moving, camera_moves, lights_move, sppi) -> tuple[str, ...]:
-        limits = super()._limits(scene, moving, camera_moves, lights_move, sppi)
-        if sppi > 0 and (self.depths.scatters(2) or scene.environment() is not None):
-            limits = (*(limit for limit in limits if limit != HARD_SHADOWS), SHADOWS_ON_FILM)
-        return (*limits, *coarse_meshes(scene)) if sppi > 0 and self.depths.scatters(1) else limits
 
     def sample_rays(self, scene, sensor, sampler):
         if self.pixel_density is None:
@@ -290,16 +269,11 @@ class RigIntegrator(EdgeIntegrator):
         return lights
 
     def _paths(self, scene) -> LightPaths:
-        lights, options = self._lights(scene), (self.lights_per_path, self.hide_emitters)
-        return LightPaths(scene, lights, self.depths, *options, self._first_hit)
+        return LightPaths(self.TRACER(scene, self), self._lights(scene), self.lights_per_path)
 
     def _choice(self, sampler, seed) -> mi.Float | None:
         """Random numbers that choose lights, stratified over the samples of a pixel, or over neighbours."""
         return stratified(sampler, seed) if self.lights_per_path else None
-
-    @staticmethod
-    def _sensor(scene, sensor) -> mi.Sensor:
-        return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
 
 
 def _whole(who: str, props: mi.Properties, key: str, default: int, least: int, most: int | None) -> int:

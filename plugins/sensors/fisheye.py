@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.projection import equidistant, from_equidistant
+from rimlight.edge_sampling.projection.sensors import equidistant, from_equidistant
 
 FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
 

@@ -42,8 +42,9 @@ from _bench import (
 )
 
 from rimlight.edge_sampling import Geometry, find_edges
-from rimlight.edge_sampling.edge_importance import EdgeSample, Lobe, View, resample, sample_edge
-from rimlight.edge_sampling.edge_tree import EdgeTree
+from rimlight.edge_sampling.choice.edge_tree import EdgeTree
+from rimlight.edge_sampling.choice.sampling import EdgeSample, resample, sample_edge
+from rimlight.edge_sampling.choice.views import Lobe, View
 
 OURS, PEER = "direct_edge", "direct_projective"
 METHODS = {OURS: {"type": OURS}, PEER: {"type": PEER}}
@@ -115,14 +116,14 @@ def mirrored_object() -> mi.Scene:
 def edges_chosen(how: str) -> Iterator[None]:
     """Replace the choice of edges: "uniformly" by length, "by normal cones" instead of moments, "without lobes" by the
     tree without the BSDF's lobes."""
-    module = import_module("rimlight.edge_sampling.edge_importance")
-    boundary = import_module("rimlight.edge_sampling.shading_boundary").ShadingBoundary
+    module = import_module("rimlight.edge_sampling.choice.sampling")
+    boundary = import_module("rimlight.edge_sampling.boundaries.shading_boundary").ShadingBoundary
     with contextlib.ExitStack() as stack:
         patch = lambda *args: stack.enter_context(mock.patch.object(*args))
         if how == "uniformly":
             patch(module, "importance", lambda node, *_: node.always + node.silhouettes)
             patch(module, "edge_importance", lambda slot, *_: dr.norm(slot.b - slot.a))
-            patch(module, "_sample_point", lambda *args: (args[-1], mi.Float(1)))
+            patch(module, "sample_point", lambda *args: (args[-1], mi.Float(1)))
         if how == "by normal cones":
             for replacement in normal_cones.replacements():
                 patch(*replacement)

@@ -16,9 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling import edge_importance
-from rimlight.edge_sampling.edge_importance import View, importance
-from rimlight.edge_sampling.edge_tree import LEAF, EdgeTree, Node, Slot
+from rimlight.edge_sampling.choice import sampling
+from rimlight.edge_sampling.choice.edge_tree import LEAF, EdgeTree, Node, Slot
+from rimlight.edge_sampling.choice.importance import importance
+from rimlight.edge_sampling.choice.views import View
 
 #: Radians by which a cone is wider than its normals: rounding must not reject.
 SLACK = 1e-3
@@ -42,8 +43,8 @@ def replacements() -> list[tuple[Any, str, Any]]:
     return [
         (EdgeTree, "refit", refit_with_cones),
         (EdgeTree, "node", node_with_cone),
-        (edge_importance, "importance", _importance),
-        (edge_importance, "edge_importance", _edge_importance),
+        (sampling, "importance", _importance),
+        (sampling, "edge_importance", _edge_importance),
     ]
 
 

@@ -6,8 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .edge_importance import Cone
-from .meshes import Geometry
+from rimlight.edge_sampling.geometry.meshes import Geometry
+
+from .views import Cone
 
 #: Cones are wider than they need be by this part of their sine, so that rounding loses no direction.
 SLACK = 1e-3

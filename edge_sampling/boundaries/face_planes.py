@@ -16,13 +16,13 @@ What a camera sees of such faces jumps at the edges between them (`film_boundary
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
-from .meshes import has_normal_map, is_smooth
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth
+from rimlight.edge_sampling.parametrisation import material_point
+
+from .tracer import ShadingPoint, Tracer, emitted_and_scattered
 
 #: Sine of the angle between the plane and the directions just beside it.
 BESIDE_PLANE = 1e-5
@@ -37,18 +37,10 @@ class FacePlanes:
         self.shapes = [s for s in scene.shapes() if (s.is_mesh() and is_smooth(s)) or has_normal_map(s)]
         self._shapes = [mi.ShapePtr(s) for s in self.shapes]
 
-    def sample(
-        self,
-        scene: mi.Scene,
-        si: mi.SurfaceInteraction3f,
-        sampler: mi.Sampler,
-        active: mi.Bool,
-        incident: Callable[[Any, Any, Any, Any, Any], mi.Spectrum],
-    ) -> mi.Spectrum:
-        """One sample of the integral at each of `si`: mi.Spectrum, (N,), zero, with its gradient.
-
-        incident : maps (ray, what it meets, its surface, sampler, active) to the light that arrives; detached.
-        """
+    def sample(self, tracer: Tracer, point: ShadingPoint, sampler: mi.Sampler) -> mi.Spectrum:
+        """One sample of the integral at each point: mi.Spectrum, (N,), zero, with the gradient of the light that is
+        reflected there."""
+        scene, si, active = tracer.scene, point.si, point.active
         with dr.suspend_grad():
             at = dr.detach(si)
             ours = mi.Bool(False)
@@ -66,12 +58,12 @@ class FacePlanes:
                 reflects = active & dr.any(F != 0)
                 pi = scene.ray_intersect_preliminary(ray, active=reflects)
                 y = pi.compute_surface_interaction(ray, mi.RayFlags.All, reflects)
-                L = incident(ray, pi, y, sampler.clone(), reflects)
+                L = emitted_and_scattered(tracer, ray, pi, y, point.depth, sampler.clone(), reflects)
                 sides.append((ray, pi, reflects & y.is_valid(), dr.select(reflects, side * F * L, 0)))
         value = mi.Spectrum(0)
         with dr.resume_grad():
             for ray, pi, valid, jump in sides:
-                y = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, valid).p
+                y = material_point(ray, pi, valid).p
                 # What is infinitely far away is seen in a fixed direction.
                 g = dr.dot(si.n, dr.normalize(dr.select(valid, y - si.p, mi.Vector3f(ω))))
                 value += jump * dr.select(active, g - dr.detach(g), 0)

@@ -25,8 +25,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .device_edges import rounding
-from .meshes import Geometry, is_smooth
+from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.meshes import Geometry, is_smooth
+
+#: Cosine to the viewer of a normal just beside the horizon.
+BESIDE_HORIZON = 1e-4
 
 
 @dataclass
@@ -213,3 +216,18 @@ def _roots(p, n, D, N, eye, far: bool) -> tuple[mi.Float, mi.Float]:
     A, B, C = -dr.dot(N, D), dr.dot(N, view) - dr.dot(n, D), dr.dot(n, view)
     q = -0.5 * (B + dr.mulsign(dr.sqrt(B * B - 4 * A * C), B))
     return C / q, q / A
+
+
+def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -> None:
+    """Turn interpolated normals that lie on the horizon of the viewer, but for rounding, to a side of it.
+
+    Does nothing to what hides the point of the horizon, nor, beside edges, to normals that face the right side.
+    """
+    to_viewer = -ray.d
+    cos = dr.dot(si.sh_frame.n, to_viewer)
+    there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o)
+    turn = there & si.is_valid() & (horizon.side != 0) & (horizon.on_curve | (horizon.side * cos <= 0))
+    n = dr.normalize(si.sh_frame.n + (horizon.side * BESIDE_HORIZON - cos) * to_viewer)
+    si.sh_frame.n = dr.select(turn, n, si.sh_frame.n)
+    si.initialize_sh_frame()
+    si.wi = dr.select(turn, si.to_local(to_viewer), si.wi)

@@ -8,11 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .curves import PIECES, Curves
-from .edge_importance import EdgeSample, View, sample_edge
+from rimlight.edge_sampling.geometry.curves import PIECES, Curves
+from rimlight.edge_sampling.geometry.edges import Edges
+from rimlight.edge_sampling.geometry.meshes import Geometry
+
 from .edge_tree import EdgeTree
-from .edges import Edges
-from .meshes import Geometry
+from .sampling import EdgeSample, sample_edge
+from .views import View
 
 #: Part of the samples that are for curves, where there are edges, too.
 CURVE_PART = 0.5

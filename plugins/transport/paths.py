@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ._scattering import Next, Scattering
+from rimlight.edge_sampling.parametrisation import look_from, material_point
+
+from .scattering import Next, Scattering
 
 
 @dataclass
@@ -117,14 +119,13 @@ class Replay:
 
         def bounce(L, tangent, before, vertex, active, sampler):
             with dr.resume_grad():
-                follow = mi.RayFlags.FollowShape
-                si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All | follow, active)
+                si = material_point(vertex.ray, vertex.pi, active, mi.RayFlags.All)
                 if scattering.directional:
-                    x = before.pi.compute_surface_interaction(before.ray, mi.RayFlags.Minimal | follow, active).p
+                    x = material_point(before.ray, before.pi, active).p
                     if moves:
                         seen = dr.gather(mi.Point3f, memory, dr.arange(mi.UInt32, width), active & (vertex.depth == 2))
                         x = dr.select(vertex.depth == 2, seen, x)
-                    si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
+                    look_from(si, x)
             direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), sampler, active)
             L -= dr.select(active, vertex.β * dr.detach(direct), 0)
             with dr.resume_grad():

@@ -13,20 +13,21 @@ where interpolated normals turn away from the viewer (`horizon.py`), and at the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .curves import Curves
-from .device_edges import DeviceEdges, line_of_sight
-from .edges import Edges
+from rimlight.edge_sampling.geometry.curves import Curves
+from rimlight.edge_sampling.geometry.device_edges import DeviceEdges, line_of_sight
+from rimlight.edge_sampling.geometry.edges import Edges
+from rimlight.edge_sampling.geometry.meshes import Geometry
+from rimlight.edge_sampling.lights import Lights
+from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
+
 from .horizon import Horizon, HorizonPoint, Horizons
-from .lights import Lights
-from .meshes import Geometry
-from .projection import Projection, inside_frame
+from .tracer import Tracer
 
 #: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
 #: an edge that cannot be seen changes nothing, not even the last bit.
@@ -124,11 +125,10 @@ class FilmBoundary:
 
     def sample(
         self,
-        scene: mi.Scene,
+        tracer: Tracer,
         sensor: mi.Sensor,
         sampler: mi.Sampler,
         count: int,
-        radiance: Callable[..., tuple[mi.Spectrum, mi.Float]],
     ) -> BoundarySamples:
         """Estimate the boundary integral over the whole film with `count` samples, whose sum is the estimate.
 
@@ -136,19 +136,18 @@ class FilmBoundary:
         stratified number. Where edges are curves on the film, angles from the eye stand for lengths.
 
         sampler : seeded for `count` lanes.
-        radiance : maps (rays, sampler, active, horizon) to (L, alpha), detached. Called for both sides of the edge
-            with equal random numbers, so that an edge that is hidden, or across which nothing jumps, contributes next
-            to nothing rather than noise.
+        tracer : tells what is `seen` on both sides of the edge, with equal random numbers, so that an edge that is
+            hidden, or across which nothing jumps, contributes next to nothing rather than noise.
 
         Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by
         it, and folds of faces that are narrower on the film do not count.
         """
         with dr.suspend_grad():
-            points = self.points(scene, sensor, sampler, count)
+            points = self.points(tracer.scene, sensor, sampler, count)
             jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
             sides = zip((-1, 1), points.rays, points.weights, points.horizons, strict=True)
             for sign, ray, weight, horizon in sides:
-                L, alpha = radiance(ray, sampler.clone(), points.active, horizon)
+                L, alpha = tracer.seen(ray, sampler.clone(), points.active, horizon)
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
             if points.sensor_moves:

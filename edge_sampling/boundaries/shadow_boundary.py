@@ -15,18 +15,21 @@ The point of the light is a *material point*, as it is for the interior derivati
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from .device_edges import beside_edge, rounding
-from .edge_importance import View, power_heuristic
-from .lights import Lights
-from .projection import Projection, inside_frame
-from .silhouettes import Silhouettes
-from .smooth_lamps import SmoothLamps
+from rimlight.edge_sampling.choice.sampling import power_heuristic
+from rimlight.edge_sampling.choice.silhouettes import Silhouettes
+from rimlight.edge_sampling.choice.views import View
+from rimlight.edge_sampling.geometry.device_edges import beside_edge, rounding
+from rimlight.edge_sampling.lights import Lights
+from rimlight.edge_sampling.parametrisation import material_point
+from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
+from rimlight.edge_sampling.smooth_lamps import SmoothLamps
+
+from .tracer import Tracer
 
 
 def throws_shadows(emitter: mi.Emitter) -> bool:
@@ -82,10 +85,9 @@ class ShadowBoundary:
 
     def sample(
         self,
-        scene: mi.Scene,
+        tracer: Tracer,
         sensor: mi.Sensor,
         sampler: mi.Sampler,
-        first_hit: Callable[[mi.Scene, mi.Ray3f, mi.Bool], mi.PreliminaryIntersection3f],
         *,
         share: bool,
     ) -> ShadowSamples:
@@ -93,10 +95,9 @@ class ShadowBoundary:
 
         The lanes are spread evenly over the lights and, for each, over the edges.
 
-        first_hit : what a camera ray meets.
         share : are shadows of surfaces sampled from shading points as well?
         """
-        silhouettes, count = self.silhouettes, sampler.wavefront_size()
+        scene, silhouettes, count = tracer.scene, self.silhouettes, sampler.wavefront_size()
         with dr.resume_grad():
             projection = Projection(sensor)
             placement = silhouettes.placement()
@@ -173,7 +174,7 @@ class ShadowBoundary:
                 active,
             )
             ray = dr.detach(ray)
-            seen = first_hit(scene, ray, active)
+            seen = tracer.first_hit(ray, active)
             active &= seen.is_valid() & (seen.shape == fallen.shape)
             si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
             # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off
@@ -236,11 +237,9 @@ class ShadowBoundary:
             q = mi.Point3f(0)
             if self.any_other:
                 q = self._off_surface(scene, light, it, far, numbers, active & ~on_surface)
-            follow = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
             if self.any_surface:
-                on_light = met.compute_surface_interaction(onwards, follow, active & on_surface)
-                q = dr.select(on_surface, on_light.p, q)
-            m = seen.compute_surface_interaction(ray, follow, active).p
+                q = dr.select(on_surface, material_point(onwards, met, active & on_surface).p, q)
+            m = material_point(ray, seen, active).p
             # From the light past the edge to the plane in which the shadow falls. (Its turning is of second order.)
             d = dr.select(far, -mi.Vector3f(q), p - q)
             origin = dr.select(far, p, q)

@@ -14,9 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .device_edges import DeviceEdges
-from .edges import Edges
-from .meshes import Geometry
+from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
+from rimlight.edge_sampling.geometry.edges import Edges
+from rimlight.edge_sampling.geometry.meshes import Geometry
 
 #: Edges of a leaf. They are tested one by one.
 LEAF = 8

@@ -18,17 +18,18 @@ finds the shadows of small lights, is divided as between the sampling of lights 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
-from .device_edges import beside_edge
-from .edge_importance import EdgeSample, Lobe, View, power_heuristic, resample
-from .emitter_boxes import EmitterBoxes
-from .silhouettes import Placement, Silhouettes
-from .smooth_lamps import SmoothLamps
+from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
+from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic, resample
+from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
+from rimlight.edge_sampling.choice.views import Lobe, View
+from rimlight.edge_sampling.geometry.device_edges import beside_edge
+from rimlight.edge_sampling.parametrisation import material_point
+from rimlight.edge_sampling.smooth_lamps import SmoothLamps
+
+from .tracer import ShadingPoint, Tracer
 
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
@@ -38,9 +39,6 @@ EMISSION = 2 / 3
 
 #: Edges from which one is kept, in proportion to what it contributes if nothing hides it.
 CANDIDATES = 4
-
-#: Scattered radiance of a point that a ray meets: called with the ray, what it meets, a sampler, a mask.
-Scattered = Callable[[Any, Any, Any, Any], Any]
 
 
 class ShadingBoundary:
@@ -89,46 +87,32 @@ class ShadingBoundary:
 
     # ---------------------- From points ----------------------
 
-    def from_points(
-        self,
-        scene: mi.Scene,
-        placement: Placement,
-        si: mi.SurfaceInteraction3f,
-        sampler: mi.Sampler,
-        choice: mi.Float,
-        active: mi.Bool,
-        *,
-        share_emission: mi.Bool | bool,
-        emission: mi.Bool | bool = True,
-        scattering: mi.Bool | bool = True,
-        scattered: Scattered | None = None,
+    def sample(
+        self, tracer: Tracer, placement: Placement, point: ShadingPoint, sampler: mi.Sampler, choice: mi.Float
     ) -> mi.Spectrum:
-        """One sample of the boundary integral at each of `si`: of the light that a light emits, or of light that is
+        """One sample of the boundary integral at each point: of the light that a light emits, or of light that is
         scattered.
 
-        placement : of the shapes, from `Silhouettes.placement`; attached. Made before `si`: in backward mode, its
+        placement : of the shapes, from `Silhouettes.placement`; attached. Made before `point`: in backward mode, its
             gradients are then complete before they are passed on, which takes one kernel, and not two.
-        si : attached to whatever moves it.
         choice : see `sample_edge`.
-        share_emission : where shadows are found from the lights, too.
-        emission : where emitted light counts at all.
-        scattering, scattered : where scattered light counts, and what it is; None: nowhere.
 
         Returns
         -------
         mi.Spectrum, (N,): zero, with the gradient of the reflected radiance.
         """
+        scene, si = tracer.scene, point.si
         with dr.suspend_grad():
             bsdf = si.bsdf()
             moves = mi.Bool(self.moving_shapes is None)
             for shape in self.moving_shapes or ():
                 moves |= si.shape == shape
-            active = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            active = point.active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
             # ---------------------- Emitted light, or scattered ----------------------
 
-            emission = mi.Bool(emission) & self.emission
-            scattering = mi.Bool(scattering) & (scattered is not None)
+            emission = ((point.depth != 1) | self.emission_at_first) & self.emission
+            scattering = mi.Bool(tracer.scatters(point.depth + 1)) & tracer.scatters(2)
             active &= emission | scattering
             # Emitted light is sought in the directions of one light, scattered light everywhere.
             p = dr.select(emission, dr.select(scattering, EMISSION, 1), 0)
@@ -164,7 +148,7 @@ class ShadingBoundary:
 
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
             e.density *= dr.select(emission, p / lights, 1 - p)
-        return self._evaluate(scene, placement, si, e, sampler, active, light, share_emission, emission, scattered)
+        return self._evaluate(tracer, placement, point, e, sampler, active, light, emission)
 
     @staticmethod
     def _lobe(si, bsdf, sampler, active) -> Lobe:
@@ -197,22 +181,23 @@ class ShadingBoundary:
 
     def _evaluate(
         self,
-        scene: mi.Scene,
+        tracer: Tracer,
         placement: Placement,
-        si: mi.SurfaceInteraction3f,
+        point: ShadingPoint,
         sample: EdgeSample,
         sampler: mi.Sampler,
         active: mi.Bool,
         light: mi.EmitterPtr,
-        share_emission: mi.Bool | bool,
         emission: mi.Bool,
-        scattered: Scattered | None,
     ) -> mi.Spectrum:
-        """What a point on an edge does to the light that is reflected at `si`.
+        """What a point on an edge does to the light that is reflected.
 
         light : the only one whose emission counts.
         emission : does emitted light count, or scattered light?
         """
+        scene, si = tracer.scene, point.si
+        # What the sensor sees has the shadows that are found from the lights, too.
+        share_emission = point.depth == 1
         with dr.suspend_grad():
             # Mitsuba's rays start above the surface: look from there.
             towards = self.silhouettes.point(placement, sample, si.p).p - si.p
@@ -250,15 +235,15 @@ class ShadingBoundary:
             if len(self.smooth_lamps):
                 L *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
             valid = active & y.is_valid()
-            if scattered is not None:
+            if tracer.scatters(2):
                 reflected = valid & ~emission
-                L += dr.select(reflected, scattered(ray, pi, sampler, reflected), 0)
+                L += dr.select(reflected, tracer.scattered(ray, pi, point.depth, sampler, reflected), 0)
             L = dr.select(active, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
             p = self.silhouettes.point(placement, sample, dr.detach(x)).p
-            y = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, valid).p
+            y = material_point(ray, pi, valid).p
             x = si.p + lift
             velocity = _turning(n_dl, p - x, active) - _turning(n_dl, y - x, valid)
             return -side * L * velocity

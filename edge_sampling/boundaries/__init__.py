@@ -1,0 +1,1 @@
+"""The boundary terms of a derivative: what edges that move do to an image."""

@@ -1,0 +1,42 @@
+"""The boundaries of one derivative, together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rimlight.edge_sampling.choice.silhouettes import Silhouettes
+
+from .face_planes import FacePlanes
+from .film_boundary import FilmBoundary
+from .shading_boundary import ShadingBoundary
+from .shadow_boundary import ShadowBoundary
+
+
+@dataclass(frozen=True)
+class Boundaries:
+    """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
+    does. Nothing where nothing moves. `limits` : what the derivative will lack."""
+
+    film: FilmBoundary | None = None
+    shadows: ShadowBoundary | None = None
+    shading: ShadingBoundary | None = None
+    planes: FacePlanes | None = None
+    moving: tuple[bool, ...] = ()
+    camera_moves: bool = False
+    lights_move: bool = False
+    limits: tuple[str, ...] = ()
+
+    @property
+    def silhouettes(self) -> Silhouettes | None:
+        return next((b.silhouettes for b in (self.shadows, self.shading) if b is not None), None)
+
+    @property
+    def anything_moves(self) -> bool:
+        return any(self.moving) or self.camera_moves or self.lights_move
+
+    def refit(self) -> None:
+        """Follow the vertices. To be called before sampling."""
+        if self.silhouettes is not None:
+            self.silhouettes.refit()
+        if self.shading is not None:
+            self.shading.refit()

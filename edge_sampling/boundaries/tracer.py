@@ -1,0 +1,74 @@
+"""What the boundaries ask of the one who traces paths for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from .horizon import Horizon
+
+
+@dataclass(frozen=True)
+class ShadingPoint:
+    """Points at which light is reflected towards the sensor, one of each path.
+
+    si : mi.SurfaceInteraction3f, (N,), attached to whatever moves it.
+    depth : mi.UInt32, number along the path; 1 is what the sensor sees.
+    β : mi.Spectrum, throughput up to there, over the probability of this point among those of its path. Detached.
+    active : mi.Bool, is there one?
+    """
+
+    si: mi.SurfaceInteraction3f
+    depth: mi.UInt32
+    β: mi.Spectrum
+    active: mi.Bool
+
+
+class Tracer(Protocol):
+    """Traces paths in a scene. All that is returned is detached.
+
+    scene : mi.Scene
+    """
+
+    scene: mi.Scene
+
+    def scatters(self, depth: mi.UInt32 | int) -> mi.Bool | bool:
+        """May a vertex of this number reflect direct light?"""
+
+    def first_hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+        """What the sensor sees along camera rays."""
+
+    def seen(
+        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """Radiance and alpha along camera rays, of which the first hit is on a side of a horizon."""
+
+    def scattered(
+        self,
+        ray: mi.Ray3f,
+        pi: mi.PreliminaryIntersection3f,
+        depth: mi.UInt32,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+    ) -> mi.Spectrum:
+        """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`."""
+
+
+def emitted_and_scattered(
+    tracer: Tracer,
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    y: mi.SurfaceInteraction3f,
+    depth: mi.UInt32,
+    sampler: mi.Sampler,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """All light that arrives along a ray from a vertex of number `depth`, which meets y. Detached."""
+    L = y.emitter(tracer.scene, active).eval(y, active)
+    if tracer.scatters(2):
+        onwards = active & y.is_valid() & tracer.scatters(depth + 1)
+        L += dr.select(onwards, tracer.scattered(ray, pi, depth, sampler, onwards), 0)
+    return L

@@ -1,0 +1,1 @@
+"""Choosing an edge, and a point on it, as a viewer sees them."""

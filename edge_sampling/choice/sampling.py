@@ -1,0 +1,209 @@
+"""Choosing an edge, and a point on it, as a point of the scene sees them: a random descent of an `EdgeTree`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from .edge_tree import LEAF, EdgeTree
+from .importance import edge_importance, importance
+from .on_edge import sample_point
+from .views import View
+
+
+@dataclass
+class EdgeSample:
+    """An edge, and a point on it.
+
+    edge : mi.UInt32, index of the edge.
+    t : mi.Float, the point is (1 - t) a + t b.
+    density : mi.Float, probability of the edge times density of t; 0 where no boundary was found.
+    """
+
+    edge: mi.UInt32
+    t: mi.Float
+    density: mi.Float
+
+
+def sample_edge(
+    tree: EdgeTree,
+    view: View,
+    sampler: mi.Sampler,
+    use: list[mi.Float | float],
+    *,
+    choice: mi.Float,
+    from_light: bool,
+    active: mi.Bool,
+) -> EdgeSample:
+    """Descend the tree at random, in proportion to the importance of the children of each node; test the edges of the
+    leaf one by one; choose a point on one.
+
+    use : for each group of edges of the tree, how much to prefer it; 0: do not choose from it.
+    choice : uniform in [0, 1); makes the first choices, so it pays to stratify it.
+    from_light : the importance of an edge falls off with the square of its distance, not with the distance itself.
+
+    Returns
+    -------
+    EdgeSample, (N,)
+    """
+    descent = _choose_group(tree, view, use, mi.Float(choice), from_light, mi.Bool(active))
+    if max(tree.depths) > 0:
+        descent = _down_to_a_leaf(tree, view, descent, sampler, from_light)
+    return _edge_of_the_leaf(tree, view, descent, sampler, from_light)
+
+
+@dataclass
+class _Descent:
+    """A way down a tree. (A Dr.Jit structure: the state of a loop.)
+
+    node : within its own tree. density : probability of the choices so far.
+    choice : uniform in [0, 1); what is left of a random number after each choice is uniform again.
+    alive : does anything down there count?
+    bottom : number of the first leaf of this tree. node_offset, leaf_offset : of this tree, among all.
+    """
+
+    node: mi.UInt32
+    density: mi.Float
+    choice: mi.Float
+    alive: mi.Bool
+    bottom: mi.UInt32
+    node_offset: mi.UInt32
+    leaf_offset: mi.UInt32
+
+
+def _choose_group(tree: EdgeTree, view: View, use, choice: mi.Float, from_light: bool, active: mi.Bool) -> _Descent:
+    """The root of one of the trees."""
+    density, total = mi.Float(1), mi.Float(0)
+    bottom, node_offset, leaf_offset = mi.UInt32(1), mi.UInt32(0), mi.UInt32(0)
+    for k, preference in enumerate(use):
+        weight = mi.Float(preference)
+        # A few edges are tested faster than their node.
+        if len(use) > 1 and max(tree.depths) > 0:
+            weight *= importance(tree.node(tree.device_node_offsets[k] + 1), view, from_light)
+        total += weight
+        p = dr.select(total > 0, weight / total, 0)
+        taken = choice < p
+        choice = dr.select(taken, choice / p, (choice - p) / (1 - p))
+        density = dr.select(taken, p, density * (1 - p))
+        bottom = dr.select(taken, tree.bottoms[k], bottom)
+        node_offset = dr.select(taken, tree.device_node_offsets[k], node_offset)
+        leaf_offset = dr.select(taken, tree.device_leaf_offsets[k], leaf_offset)
+    root = dr.full(mi.UInt32, 1, dr.width(view.p))
+    return _Descent(root, density, choice, active & (total > 0), bottom, node_offset, leaf_offset)
+
+
+def _down_to_a_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler, from_light: bool) -> _Descent:
+    def down(node, density, choice, alive, sampler):
+        child = 2 * node
+        weights = [importance(tree.node(child + k + at.node_offset, alive), view, from_light) for k in (0, 1)]
+        total = weights[0] + weights[1]
+        alive &= total > 0
+        choice = _renewed(choice, density, sampler, alive)
+        p = weights[0] / total
+        left = choice < p
+        choice = dr.select(left, choice / p, (choice - p) / (1 - p))
+        density = dr.select(alive, density * dr.select(left, p, 1 - p), 0)
+        node = dr.select(alive, child + dr.select(left, mi.UInt32(0), mi.UInt32(1)), node)
+        return node, density, choice, alive, sampler
+
+    node, density, choice, alive, _ = dr.while_loop(
+        (at.node, at.density, at.choice, at.alive, sampler),
+        lambda n, d, c, a, s: a & (n < at.bottom),
+        down,
+        label="edge tree",
+    )
+    return replace(at, node=node, density=density, choice=choice, alive=alive)
+
+
+def _edge_of_the_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler, from_light: bool) -> EdgeSample:
+    width, alive = dr.width(view.p), at.alive
+    choice = _renewed(at.choice, at.density, sampler, alive)
+    first = (at.node - at.bottom + at.leaf_offset) * LEAF
+
+    def test(k, total, chosen, weight, choice):
+        slot = tree.slot(first + k, alive)
+        w = edge_importance(slot, view, from_light)
+        total += w
+        p = dr.select(total > 0, w / total, 0)
+        taken = choice < p
+        choice = dr.select(taken, choice / p, (choice - p) / (1 - p))
+        return k + 1, total, dr.select(taken, k, chosen), dr.select(taken, w, weight), choice
+
+    state = (dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width), dr.zeros(mi.UInt32, width))
+    _, total, chosen, weight, choice = dr.while_loop(
+        (*state, dr.zeros(mi.Float, width), choice),
+        lambda k, *_: alive & (k < tree.leaf_size),
+        test,
+        label="edges of a leaf",
+    )
+    alive &= total > 0
+    slot = first + chosen
+    which = sampler.next_1d(alive) if view.lobes else mi.Float(0)
+    t, pdf = sample_point(tree.slot(slot, alive), view, which, choice)
+    density = dr.select(alive, at.density * weight / total * pdf, 0)
+    return EdgeSample(dr.gather(mi.UInt32, tree.slot_edge, slot, alive), t, dr.select(dr.isfinite(density), density, 0))
+
+
+def resample(
+    draw: Callable[[mi.Float, mi.Sampler], EdgeSample],
+    target: Callable[[EdgeSample], mi.Float],
+    sampler: mi.Sampler,
+    count: int,
+    active: mi.Bool,
+) -> EdgeSample:
+    """Of a few samples keep one, in proportion to `target` over density (Talbot et al. 2005, "Importance Resampling for
+    Global Illumination"): the more there are, the closer the density comes to `target`.
+
+    draw : makes the k-th sample.
+    target : of the density with respect to t; 0 only where the integrand is.
+
+    Returns
+    -------
+    EdgeSample, (N,). Its `density` is what an unbiased estimate divides by, though no density.
+    """
+
+    def step(k, kept, t, value, total, sampler):
+        e = draw(k, sampler)
+        new = target(e)
+        weight = dr.select(e.density > 0, new / e.density, 0)
+        weight = dr.select(active & dr.isfinite(weight), weight, 0)
+        total += weight
+        taken = sampler.next_1d(active) * total < weight
+        choose = lambda a, b: dr.select(taken, a, b)
+        return k + 1, choose(e.edge, kept), choose(e.t, t), choose(new, value), total, sampler
+
+    width = dr.width(active)
+    zero = dr.zeros(mi.Float, width)
+    _, edge, t, value, total, _ = dr.while_loop(
+        (mi.Float(zero), dr.zeros(mi.UInt32, width), mi.Float(zero), mi.Float(zero), mi.Float(zero), sampler),
+        lambda k, *_: active & (k < count),
+        step,
+        label="candidates",
+    )
+    return EdgeSample(edge, t, dr.select(total > 0, value * count / total, 0))
+
+
+def _renewed(choice: mi.Float, density: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+    """A random number has 24 bits. Where choices have used up eight, a fresh one takes its place."""
+    return dr.select(density < 2**-8, sampler.next_1d(active), choice)
+
+
+def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
+    """Weight of a strategy with density a against one with density b (Veach 1997, Eq. 9.13, with β = 2)."""
+    a2, b2 = dr.square(a), dr.square(b)
+    return dr.select(a2 > 0, a2 / (a2 + b2), 0)
+
+
+def stratified(sampler: mi.Sampler, seed: mi.UInt32 | int) -> mi.Float:
+    """Uniform numbers, of which each 64 that follow one another are stratified, and each 2, 4, … of these as well:
+    the van der Corput sequence, jittered, and shifted for each 64 by another random number, so that each number by
+    itself is uniform."""
+    i = dr.arange(mi.UInt32, sampler.wavefront_size())
+    if not isinstance(seed, mi.UInt32):
+        seed = dr.opaque(mi.UInt32, int(seed))
+    shift = mi.sample_tea_float32(i >> 6, seed)
+    x = (mi.Float(dr.brev(i << 26)) + sampler.next_1d()) / 64 + shift
+    return dr.minimum(x - dr.floor(x), dr.one_minus_epsilon(mi.Float))

@@ -1,0 +1,188 @@
+"""What every sample of a derivative holds fixed while the parameters change, and how the rest follows it.
+
+A derivative may be taken under the integral over any sample space, as long as the boundaries move as the same space has
+it: what the interior term holds fixed is what the sides of a boundary move with. This is the one place that decides it:
+
+====================================  ======================================================================
+what the camera sees                  the film position: the *ray* is fixed on the film, and moves with the camera
+every further vertex of a path        the *material point*, which follows its surface
+a point on a lamp                     the material point
+one side of a boundary                as the interior term has the point that is seen there
+a point of a light without size       the light's own numbers: it goes where the light goes
+what is infinitely far away           the direction
+what a perfect mirror shows           the random numbers: the ray turns with the mirror
+====================================  ======================================================================
+
+With the solid angle written as area, dω = |cos θ_y| dA(y) / r², a material point y makes the integrand a product, of
+which every factor follows the motion of x and y (Zhang et al. 2020, "Path-space differentiable rendering"). So what
+moves together sees no motion at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .smooth_lamps import SmoothLamps
+
+#: Cosine below which a surface that is no mesh is taken to stand still. Where a fixed ray meets a curved one, and the
+#: solid angle that an element of it covers, change as 1 / cos; single precision does not know cosines of 1e-4, and
+#: single samples would outweigh all others. The loss is of this order, relative to what the surface itself contributes.
+GRAZING = 1e-3
+
+#: Height over a tangent plane that is taken for rounding, in units in the last place of the coordinates.
+FLUSH = 16
+
+
+# ---------------------- Points ----------------------
+
+
+def seen_by_camera(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool, *, attached: bool
+) -> mi.SurfaceInteraction3f:
+    """The surface that a camera ray meets. A surface that moves is met by a fixed ray; a ray that moves with the camera
+    takes its hit along. With all its derivatives but where the surface is curved, and seen edge-on."""
+    with dr.resume_grad(when=attached):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        if attached:
+            si = dr.select(grazes(si, ray.d, active), dr.detach(si), si)
+        return si
+
+
+def material_point(
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    active: mi.Bool,
+    flags: mi.RayFlags = mi.RayFlags.Minimal,
+) -> mi.SurfaceInteraction3f:
+    """What a ray meets; it follows its surface, attached unless gradients are suspended."""
+    return pi.compute_surface_interaction(ray, flags | mi.RayFlags.FollowShape, active)
+
+
+def shown_by_mirror(
+    si: mi.SurfaceInteraction3f, wo: mi.Vector3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """The surface that a ray meets which leaves `si` in the direction `wo` of its frame, both attached: what a mirror
+    shows slides over the surface."""
+    turned = mi.Ray3f(ray)
+    turned.o, turned.d = si.p, si.to_world(wo)
+    return pi.compute_surface_interaction(turned, mi.RayFlags.All, active)
+
+
+def look_from(si: mi.SurfaceInteraction3f, x: mi.Point3f) -> None:
+    """Attach the direction in which a surface is looked at to the point x that looks."""
+    si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
+
+
+def grazes(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+    """Is a curved surface met almost along a tangent?"""
+    return active & si.is_valid() & ~si.shape.is_mesh() & (dr.abs_dot(dr.detach(si.n), dr.detach(direction)) < GRAZING)
+
+
+def flush(x: mi.SurfaceInteraction3f, y: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Does y lie in the tangent plane at x, or x in that at y, as far as single precision can tell?
+
+    So do points of one face, and points close to each other on one curved surface: one does not light the other, but
+    the cosine between them is what rounding makes it, and its derivative relative to that is arbitrarily large.
+    """
+    with dr.suspend_grad():
+        d = y.p - x.p
+        scale = dr.max(dr.maximum(dr.abs(x.p), dr.abs(y.p)))
+        height = dr.minimum(dr.abs_dot(x.n, d), dr.abs_dot(y.n, d))
+        return height <= FLUSH * dr.epsilon(mi.Float) * scale
+
+
+# ---------------------- What joins two of them ----------------------
+
+
+@dataclass
+class Connection:
+    """What joins a point to a material point y that a ray from there meets. Attached.
+
+    y : mi.SurfaceInteraction3f.
+    ω : mi.Vector3f, the direction to it.
+    geometry : mi.Float, |cos θ_y| dA / r², relative to its present value.
+    still : mi.Bool, is all of this taken to stand still, since rounding would make its derivative? Then it is detached.
+    smooth : mi.Bool, is y on one of the `SmoothLamps`, and does not stand still?
+    spread : mi.Float, if so: the solid angle of an element of area there, as light samples reckon it, relative to its
+        present value.
+    """
+
+    y: mi.SurfaceInteraction3f
+    ω: mi.Vector3f
+    geometry: mi.Float
+    still: mi.Bool
+    smooth: mi.Bool
+    spread: mi.Float
+
+    def attach(self, weight: mi.Float, p: mi.Float, q: mi.Float, *, by_light: bool) -> mi.Float:
+        """Attach a weight of multiple importance sampling where y is on one of the `SmoothLamps`.
+
+        p, q : the densities of which it is made, that of light samples detached. by_light : is that p, or q?
+        """
+        attached = self.smooth & (self.spread > 0) & (p > 0) & dr.isfinite(p) & dr.isfinite(q)
+        spread = dr.select(attached, self.spread, 1)
+        ratio = dr.select(attached, q, 0) / dr.select(attached, p, 1) * (spread if by_light else dr.rcp(spread))
+        return dr.select(attached, dr.replace_grad(weight, dr.rcp(1 + dr.square(ratio))), weight)
+
+
+class Parametrisation:
+    """What the samples of a scene hold fixed, where they are not single points.
+
+    scene : mi.Scene, whose parameters carry their gradients already.
+    """
+
+    def __init__(self, scene: mi.Scene):
+        self.moving = [(mi.ShapePtr(s), s.is_mesh()) for s in scene.shapes() if s.parameters_grad_enabled()]
+        self.any_curved = any(not s.is_mesh() for s in scene.shapes())
+        self.smooth_lamps = SmoothLamps(scene)
+
+    def connect(self, si, pi, ray, active, *, by_light: bool) -> Connection:
+        """What joins `si` to the material point that `pi` stands for, found by a sample of a light or of the BSDF."""
+        y = material_point(ray, pi, active, mi.RayFlags.All)
+        d = y.p - si.p
+        r2 = dr.squared_norm(d)
+        ω = d * dr.rsqrt(r2)
+        # A ray that meets nothing keeps its direction.
+        y.wi = dr.select(active, dr.replace_grad(y.wi, y.to_local(-ω)), y.wi)
+        cos, smooth, spread = dr.abs_dot(y.n, ω), mi.Bool(False), mi.Float(1)
+        if len(self.smooth_lamps):
+            smooth, shading_cos = self.smooth_lamps.are(pi.shape), dr.abs_dot(y.sh_frame.n, ω)
+            spread = _relative(shading_cos / r2)  # 0 only where nothing is emitted
+            if by_light:
+                cos = dr.select(smooth, shading_cos, cos)
+        geometry = cos / r2
+        if self.moving:
+            geometry *= self._area(pi, ray, active)
+        geometry = _relative(geometry)
+        still = active & flush(si, y)
+        fixed = still | grazes(y, ω, active) if self.any_curved else still
+        y, ω = dr.select(still, dr.detach(y), y), dr.select(still, dr.detach(ω), ω)
+        return Connection(y, ω, dr.select(fixed, dr.detach(geometry), geometry), still, smooth & ~still, spread)
+
+    def _area(self, pi, ray, active):
+        """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
+        on_mesh, on_other = mi.Bool(False), mi.Bool(False)
+        for shape, is_mesh in self.moving:
+            on_mesh |= is_mesh & (pi.shape == shape)
+            on_other |= (not is_mesh) & (pi.shape == shape)
+        on_mesh, on_other = on_mesh & active, on_other & active
+        # Of a triangle, twice its area.
+        corners = []
+        for u, v in ((0, 0), (1, 0), (0, 1)):
+            corner = mi.PreliminaryIntersection3f(pi)
+            corner.prim_uv = mi.Point2f(u, v)
+            corners.append(material_point(ray, corner, on_mesh).p)
+        area = dr.select(on_mesh, dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0])), 1)
+        if all(is_mesh for _, is_mesh in self.moving):
+            return area
+        si = material_point(ray, pi, on_other, mi.RayFlags.dPdUV)
+        return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
+
+
+def _relative(x: mi.Float) -> mi.Float:
+    """A number over its present value; 0 where that is 0."""
+    now = dr.detach(x)
+    return dr.select(now > 0, x / dr.select(now > 0, now, 1), 0)

@@ -1,0 +1,1 @@
+"""From world space to the film."""

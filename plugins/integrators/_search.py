@@ -1,0 +1,178 @@
+"""The search for the boundaries of a scene, and how long what it found can be kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rimlight._collection import collect_before
+from rimlight.edge_sampling import (
+    Edges,
+    FacePlanes,
+    FilmBoundary,
+    Geometry,
+    Lights,
+    ShadingBoundary,
+    ShadowBoundary,
+    Silhouettes,
+    Sources,
+    find_welded_edges,
+)
+from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.transport import Depths
+
+from ._limits import Media, Moving, PartialParameters, beyond_far_plane, lasting_limits
+
+#: Parameters of a light that move the shadows in it.
+PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction")
+
+
+class BoundarySearch:
+    """Finds the boundaries that can contribute to a derivative. Edges are kept as long as what they were derived from
+    stays as it was (`Sources`), and boundaries besides for each answer to the question what moves.
+
+    Parameters
+    ----------
+    who : name of the integrator, for messages.
+    depths : of its paths.
+    planes : does its derivative have what the planes of faces do to soft light, where other normals shade?
+    from_points : does it have boundaries as shading points see them?
+    """
+
+    DRJIT_STRUCT = dict.fromkeys(("_boundaries",))  # for `dr.freeze`
+
+    def __init__(self, who: str, depths: Depths, *, planes: bool, from_points: bool):
+        self.who, self.depths, self.planes, self.from_points = who, depths, planes, from_points
+        self.geometry: Geometry | None = None
+        self.edges: Edges | None = None
+        self._sources: Sources | None = None
+        self._checked = False
+        self._partial: PartialParameters | None = None
+        self._media: Media | None = None
+        self._beyond: dict[tuple, tuple[mi.Sensor, list[str]]] = {}
+        self._boundaries: dict[tuple, Boundaries] = {}
+
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor, sppi: int) -> Boundaries:
+        """Find them for a frozen function, which is to be called next, and cannot look for itself."""
+        boundaries = self.boundaries(scene, sensor, sppi)
+        self._checked = True
+        return boundaries
+
+    def boundaries(self, scene: mi.Scene, sensor: mi.Sensor, sppi: int) -> Boundaries:
+        """The boundaries that can contribute to a derivative with respect to the parameters that carry a gradient now.
+
+        sppi : samples per pixel of the boundaries at shading points.
+        """
+        geometry, params = Geometry.of(scene), mi.traverse(scene)
+        self._renew(scene, params, geometry)
+        with dr.resume_grad():
+            self._media.refuse_gradients(self.who)
+            limits = (*self._media.limits(), *self._partial.limits())
+            geometry.refuse_moving_others(params, self.who)
+            moving = self._what_moves(scene, sensor, geometry)
+        if not moving.anything:
+            return Boundaries(limits=limits)
+        if not self._checked:
+            # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
+            self._refuse_while_recording()
+        key = (*moving.key, sppi > 0)
+        if key not in self._boundaries:
+            self._refuse_while_recording()
+            self._boundaries[key] = self._find(scene, moving, sppi)
+        boundaries = self._boundaries[key]
+        if boundaries.shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
+            boundaries.shading.boxes.find_shapes()
+        limits += (*boundaries.limits, *self._limits_of_sensor(sensor, moving))
+        return replace(boundaries, limits=limits)
+
+    # ---------------------- Edges ----------------------
+
+    def _renew(self, scene, params, geometry) -> None:
+        """Find the edges, if what they were derived from is no longer the same."""
+        same = self._sources is not None and self._sources.same_objects(scene, params, geometry)
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            same, self._checked = same and self._sources.same_content(geometry), False
+        if same:
+            return
+        self._refuse_while_recording()
+        # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
+        self.geometry = self.edges = self._sources = self._partial = self._media = None
+        self._boundaries, self._beyond = {}, {}
+        collect_before()
+        self.geometry = geometry
+        self.edges, weld = find_welded_edges(geometry)
+        self._sources = Sources(scene, params, geometry, self.edges, weld)
+        self._partial, self._media = PartialParameters(scene), Media(scene)
+
+    def _refuse_while_recording(self) -> None:
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise RuntimeError(
+                f"{self.who}: a frozen function cannot find the edges. Let it do so before: "
+                "`@dr.freeze(state_fn=lambda scene, integrator, *_: integrator.find_boundaries(scene))`."
+            )
+
+    # ---------------------- What moves ----------------------
+
+    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry) -> Moving:
+        moves = geometry.moving()
+        camera = any(dr.grad_enabled(value) for _, value in mi.traverse(sensor).items())
+        if camera and geometry.others:
+            names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
+            raise RuntimeError(
+                f"{self.who}: the camera moves past {names}, whose silhouettes cannot be sampled yet. "
+                "Replace them by meshes."
+            )
+        shapes = (*geometry.meshes, *geometry.analytic)
+        lamps = any(s.is_emitter() and m for s, m in zip(shapes, moves, strict=True))
+        others = [mi.traverse(e) for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
+        lights = lamps or any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
+        return Moving(shapes, moves, camera, lights)
+
+    # ---------------------- Boundaries ----------------------
+
+    def _find(self, scene: mi.Scene, moving: Moving, sppi: int) -> Boundaries:
+        lights = Lights(scene)
+        on_film = np.array([m or moving.camera for m in moving.flags], bool)
+        sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
+        soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
+        film = FilmBoundary(self.geometry, self.edges, on_film, lights, soft=soft) if on_film.any() else None
+        film = film if film is not None and any(film.counts) else None
+        planes = self._face_planes(scene, moving) if soft and sppi else None
+        shadows, shading = self._in_reflected_light(scene, moving, sppi)
+        abilities = {"planes": self.planes, "from_points": self.from_points}
+        limits = lasting_limits(scene, self.geometry, self.edges, self.depths, moving, sppi, **abilities)
+        return Boundaries(film, shadows, shading, planes, moving.flags, moving.camera, moving.lights, limits)
+
+    def _in_reflected_light(
+        self, scene: mi.Scene, moving: Moving, sppi: int
+    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None]:
+        """What samples the edges of which lights and shading points know, as far as it is needed."""
+        if not sppi or not scene.emitters() or not self.depths.scatters(1):
+            return None, None
+        everything = moving.camera or moving.lights
+        silhouettes = Silhouettes(self.geometry, self.edges, None if everything else moving.flags)
+        if not len(silhouettes):
+            return None, None
+        shadows, shading = ShadowBoundary(scene, silhouettes), None
+        if self.from_points:
+            shading = ShadingBoundary(scene, silhouettes, None if everything else list(moving.shapes))
+            shading = shading if self.depths.scatters(2) or shading.emission_at_first else None
+        return shadows if len(shadows) else None, shading
+
+    def _face_planes(self, scene: mi.Scene, moving: Moving) -> FacePlanes | None:
+        """What samples the planes of faces, if what they hide can change: where the faces move, or what lights them.
+        (The camera alone moves neither.)"""
+        planes = FacePlanes(scene)
+        what_lights = moving.lights or (moving.shapes and self.depths.scatters(2))
+        return planes if planes.shapes and (what_lights or any(s in moving.shapes for s in planes.shapes)) else None
+
+    def _limits_of_sensor(self, sensor: mi.Sensor, moving: Moving) -> list[str]:
+        """What the derivative will lack as seen from this sensor. Found once, since it looks at positions."""
+        key = (id(sensor), moving.flags, moving.camera)
+        if key not in self._beyond and not dr.flag(dr.JitFlag.FreezingScope):
+            # With the sensor, so that its number is given to no other one.
+            self._beyond[key] = sensor, beyond_far_plane(sensor, list(moving.on_film))
+        return self._beyond[key][1] if key in self._beyond else []

@@ -1,0 +1,222 @@
+"""The base of the integrators with edge sampling: Mitsuba's interface, and the sum over the terms of a derivative."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.python.ad.integrators.common import ADIntegrator
+
+from rimlight._collection import no_collection
+from rimlight._plan import Plan, names
+from rimlight.edge_sampling import Batch
+from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.terms import TERMS, Counts, FilmSamples, Job, Sample
+from rimlight.transport import Depths, PathTracer
+
+from ._finite import report_gradients, report_image, values_of
+from ._options import check_options, is_whole
+from ._search import BoundarySearch
+
+
+class EdgeIntegrator(ADIntegrator):
+    """Base of the integrators whose derivative has an interior term, of what a tracer finds along camera rays, and
+    boundary terms, from the edges of the scene.
+
+    max_depth, rr_depth : of paths, as in Mitsuba's `path`.
+
+    Raises
+    ------
+    ValueError : a property is not among `OPTIONS`, or has a value that it cannot have.
+    """
+
+    #: Names of the properties. Subclasses that have more extend them.
+    OPTIONS: tuple[str, ...] = ("sppc", "sppp", "sppi", "hide_emitters")
+
+    #: Properties that are accepted, but have no effect.
+    IDLE: tuple[str, ...] = ()
+
+    #: What traces paths: a subclass of `PathTracer`.
+    TRACER: type[PathTracer] = PathTracer
+
+    #: Does the derivative have what the planes of faces do to soft light, where other normals shade?
+    PLANES = True
+
+    #: Does it have boundaries as shading points see them?
+    FROM_POINTS = True
+
+    def __init__(self, props: mi.Properties, max_depth: int = 2, rr_depth: int = 5):
+        check_options(props, self.OPTIONS, self.IDLE)
+        super().__init__(props)
+        self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
+        self.name = props.plugin_name()
+        if mi.is_polarized:
+            raise ValueError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
+        self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
+        self.search = BoundarySearch(self.name, self.depths, planes=self.PLANES, from_points=self.FROM_POINTS)
+        self._warned: set[str] = set()
+
+    def _sample_count(self, props: mi.Properties, key: str) -> int | None:
+        value = props.get(key, None)
+        if value is not None and (not is_whole(value) or value < 0):
+            raise ValueError(f'{self.name}: "{key}" must be a whole number >= 0, got {value}')
+        return value
+
+    def to_string(self) -> str:
+        counts = f"sppc={self.sppc}, sppp={self.sppp}, sppi={self.sppi}"
+        return f"{type(self).__name__}[{counts}, hide_emitters={self.hide_emitters}]"
+
+    # ---------------------- Mitsuba's interface ----------------------
+
+    @no_collection()
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """The image, as Mitsuba has it."""
+        return super().render(scene, sensor, seed, spp, develop, evaluate)
+
+    @no_collection()
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        """Derivative of the image along the gradients that are set on the parameters.
+
+        Returns
+        -------
+        mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
+        """
+        if params is not None and not any(dr.grad_enabled(v) for v in values_of(params).values()):
+            raise RuntimeError(f"{self.name}: none of the parameters carries a gradient")
+        with dr.suspend_grad():
+            job = self.job(scene, sensor, seed, spp, dr.ADMode.Forward)
+            job.boundaries.refit()
+            terms, values = [], []
+            for make in (make for term in TERMS for make in term.samples(job)):
+                # One term after the other: path replay needs that nothing else is attached to the parameters.
+                term = make()
+                with dr.resume_grad():
+                    # A parameter that carries a gradient may well not show in the image: then the derivative is zero.
+                    first = term.replay.first if term.replay is not None else mi.Point3f(0)
+                    value, first = dr.forward_to(
+                        [term.value, first], flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+                    )
+                term = term.detached()
+                if term.replay is not None:
+                    value.L += term.throughput * term.replay.forward(first)
+                terms.append(term)
+                values.append(value)
+            image = self._develop(job.sensor.film(), terms, values)
+        report_image(self.name, image)
+        return image
+
+    @no_collection()
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the
+        image, makes of them."""
+        # Isolated, so that what lies behind the parameters is traversed once, and last: the sensor's share comes late.
+        with dr.isolate_grad(), dr.suspend_grad():
+            job = self.job(scene, sensor, seed, spp, dr.ADMode.Backward)
+            job.boundaries.refit()
+            terms = [make() for term in TERMS for make in term.samples(job)]
+            with dr.resume_grad():
+                # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
+                # is traced for it.
+                values = [dr.zeros(type(t.value), dr.width(t.position)) for t in terms]
+                dr.enable_grad(values)
+                image = self._develop(job.sensor.film(), terms, values)
+                dr.set_grad(image, grad_in)
+                dr.enqueue(dr.ADMode.Backward, image)
+                dr.traverse(dr.ADMode.Backward)
+                for term, value in zip(terms, values, strict=True):
+                    gradient = dr.grad(value)
+                    if term.replay is not None:
+                        with dr.suspend_grad():
+                            first = term.replay.backward(gradient.L * term.throughput)
+                        if first is not None:
+                            dr.set_grad(term.replay.first, first)
+                            dr.enqueue(dr.ADMode.Backward, term.replay.first)
+                    dr.set_grad(term.value, gradient)
+                    dr.enqueue(dr.ADMode.Backward, term.value)
+                dr.traverse(dr.ADMode.Backward)
+                for term in terms:
+                    if term.rays is not None:
+                        term.rays.backward()
+            dr.eval()
+        report_gradients(self.name, params)
+
+    @staticmethod
+    def _develop(film: mi.Film, terms: list[FilmSamples], values: list[Sample]) -> mi.TensorXf:
+        """The image that the film makes of `values` at the positions of `terms`: (H, W, C)."""
+        film.prepare([])
+        for term, value in zip(terms, values, strict=True):
+            block = film.create_block()
+            # Mitsuba may add up neighbours in a wavefront first, if those belong to one pixel.
+            block.set_coalesce(block.coalesce() and term.per_pixel >= 4)
+            ADIntegrator._splat_to_block(
+                block, film, term.position, value.L, term.weight, value.alpha, [], term.wavelengths
+            )
+            film.put_block(block)
+        return film.develop()
+
+    def sample(self, mode, scene, sampler, ray, active=True, **_):
+        """Radiance along camera rays, as Mitsuba asks for it."""
+        found = self.TRACER(scene, self).radiance(ray, sampler, mi.Bool(active), attached=mode != dr.ADMode.Primal)
+        return found.L, found.valid, [], found.rest
+
+    def sample_rays(self, scene, sensor, sampler):
+        """Camera rays, their weights, and film positions in pixels, as Mitsuba has it."""
+        batch = sensor.class_name() == "BatchSensor"
+        return super().sample_rays(scene, Batch(sensor) if batch else sensor, sampler)
+
+    # ---------------------- What is to be done ----------------------
+
+    def job(self, scene, sensor, seed=0, spp=0, mode=dr.ADMode.Primal) -> Job:
+        """A derivative with respect to the parameters that carry a gradient now. Warns of what it will lack."""
+        sensor = self._sensor(scene, sensor)
+        counts = self._counts(sensor, spp)
+        boundaries = self._boundaries(scene, sensor, counts.shading)
+        rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
+        return Job(self.TRACER(scene, self), sensor, boundaries, counts, rays, seed, mode)
+
+    @no_collection()
+    def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:
+        """What a derivative with respect to the parameters that carry a gradient now will do, see `rimlight.plan`."""
+        with dr.suspend_grad():
+            job = self.job(scene, sensor, spp=spp)
+        found, search = job.boundaries, self.search
+        shapes = zip((*search.geometry.meshes, *search.geometry.analytic), found.moving, strict=False)
+        return Plan(
+            integrator=self.name,
+            moving=names(s for s, moves in shapes if moves),
+            camera_moves=found.camera_moves,
+            lights_move=found.lights_move,
+            edges=len(search.edges),
+            tree=found.silhouettes.leaves if found.silhouettes is not None else 0,
+            terms=tuple(term.planned(job) for term in TERMS),
+            limits=found.limits,
+        )
+
+    @no_collection()
+    def find_boundaries(self, scene, sensor=0) -> Boundaries:
+        """Find the edges that can contribute to a derivative with respect to the parameters that carry a gradient now.
+
+        Derivatives do this by themselves, but not inside of a function that `dr.freeze` records, since the search runs
+        on the host. Give this as the function's `state_fn`.
+
+        Returns
+        -------
+        What a frozen function depends on (a PyTree).
+        """
+        sensor = self._sensor(scene, sensor)
+        with dr.suspend_grad():
+            return self._boundaries(scene, sensor, self._counts(sensor, 0).shading, self.search.prepare)
+
+    def _boundaries(self, scene, sensor, sppi, find=None) -> Boundaries:
+        boundaries = (find or self.search.boundaries)(scene, sensor, sppi)
+        for message in boundaries.limits:
+            if message not in self._warned:
+                self._warned.add(message)
+                mi.Log(mi.LogLevel.Warn, f"{self.name}: {message}")
+        return boundaries
+
+    def _counts(self, sensor: mi.Sensor, spp: int) -> Counts:
+        return Counts.of(self.sppc, self.sppp, self.sppi, spp, sensor)
+
+    @staticmethod
+    def _sensor(scene, sensor) -> mi.Sensor:
+        return scene.sensors()[sensor] if isinstance(sensor, int) else sensor

@@ -1,0 +1,71 @@
+"""Boundaries as shading points see them, as a term."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight._plan import PlannedTerm
+from rimlight.edge_sampling import stratified
+from rimlight.transport import CutRays
+
+from .sampling import over_film, seed_of
+from .shadows import nothing_at_points
+from .term import FilmSamples, Job, Sample, Term
+
+
+class FromPoints(Term):
+    """What one vertex of each path sees of boundaries."""
+
+    def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
+        return [lambda: self._samples(job)] if self.boundary(job) is not None else []
+
+    def _samples(self, job: Job) -> FilmSamples:
+        seed = seed_of(self.name, job.seed)
+        sampler, spp = over_film(job.sensor, seed, job.counts.shading)
+        ray, ray_weight, position = job.sample_rays(sampler)
+        choice = stratified(sampler, seed)
+        rays = CutRays(job.mode)
+        L = self.reflected(job, rays(ray), sampler, choice)
+        with dr.resume_grad():
+            value = Sample(mi.Spectrum(L * ray_weight * (job.weights / spp)), mi.Float(0))
+            return FilmSamples(position, value, ray.wavelengths, 0.0, spp, rays=rays)
+
+    @abstractmethod
+    def boundary(self, job: Job) -> object | None:
+        """What is sampled; None: nothing."""
+
+    @abstractmethod
+    def reflected(self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float) -> mi.Spectrum:
+        """What the boundary does to the light along camera rays: mi.Spectrum, (N,), zero, with its gradient.
+
+        choice : uniform in [0, 1), stratified.
+        """
+
+
+class PointsTerm(FromPoints):
+    """Edges that hide, from a vertex, light that it would reflect."""
+
+    name = "edges from points"
+
+    def planned(self, job: Job) -> PlannedTerm:
+        count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0
+        why = "light that is scattered may be occluded" if job.segments > 2 else "glossy surfaces, or an environment"
+        from_lights = job.boundaries.shadows is not None
+        why_not = "direct light: found from the lights" if from_lights else nothing_at_points(job)
+        return self.plan(count, 1 + job.rays_of_path, why, why_not)
+
+    def boundary(self, job: Job) -> object | None:
+        return job.boundaries.shading
+
+    def reflected(self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float) -> mi.Spectrum:
+        shading = job.boundaries.shading
+        with dr.resume_grad():
+            placement = shading.silhouettes.placement()
+        point = job.tracer.point(ray, sampler)
+        L = shading.sample(job.tracer, placement, point, sampler, choice)
+        with dr.resume_grad():
+            return L * point.β

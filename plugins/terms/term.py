@@ -1,0 +1,121 @@
+"""What a term is, and what it makes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight._plan import PlannedTerm
+from rimlight.edge_sampling import FilmPart, film_parts
+from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.transport import CutRays, PathTracer, Replay
+
+from .sampling import Counts, per_pixel, size
+
+#: Longest path that a plan counts rays of.
+LONG = 16
+
+
+@dataclass
+class Sample:
+    """Radiance and alpha of film samples, or their derivatives. (A Dr.Jit structure: not frozen.)"""
+
+    L: mi.Spectrum
+    alpha: mi.Float
+
+
+@dataclass(frozen=True)
+class FilmSamples:
+    """The film samples of one term of the derivative.
+
+    position : mi.Point2f, (N,), pixels.
+    value : attached; only its gradient counts.
+    weight : of each sample in the film's weight channel.
+    per_pixel : how many neighbours in the wavefront belong to one pixel, 0 if they are in no order.
+    replay : None, or what differentiates the part of the path that `value` is not attached to.
+    throughput : of the camera ray, which weighs that part.
+    rays : None, or the cut between `value` and the sensor.
+    """
+
+    position: mi.Point2f
+    value: Sample
+    wavelengths: mi.Spectrum
+    weight: float
+    per_pixel: int
+    replay: Replay | None = None
+    throughput: mi.Spectrum | None = None
+    rays: CutRays | None = None
+
+    def detached(self) -> FilmSamples:
+        return replace(self, value=dr.detach(self.value))
+
+
+@dataclass(frozen=True)
+class Job:
+    """One derivative: of what, as seen from where, along which boundaries, with how many samples.
+
+    sample_rays : maps a sampler to camera rays, their weights, and film positions in pixels.
+    """
+
+    tracer: PathTracer
+    sensor: mi.Sensor
+    boundaries: Boundaries
+    counts: Counts
+    sample_rays: Callable[[mi.Sampler], tuple[Any, Any, Any]]
+    seed: int | mi.UInt32 = 0
+    mode: dr.ADMode = dr.ADMode.Primal
+
+    @cached_property
+    def parts(self) -> list[FilmPart]:
+        """Of the film."""
+        return film_parts(self.sensor)
+
+    @cached_property
+    def weights(self) -> int:
+        """At each pixel, the weights of the interior samples add up to so many times the integral of the filter. The
+        film divides by that sum: so samples of boundaries, of weight zero, are normalised as the image is, for every
+        filter."""
+        return per_pixel(self.sensor, self.counts.weights)
+
+    # ---------------------- For plans ----------------------
+
+    @property
+    def pixels(self) -> int:
+        width, height = size(self.sensor.film())
+        return width * height
+
+    @property
+    def segments(self) -> int:
+        """Of the longest path that a plan counts."""
+        return min(self.tracer.depths.max_depth, LONG)
+
+    @property
+    def rays_of_path(self) -> int:
+        return 1 + 2 * max(self.segments - 1, 0)
+
+
+class Term(ABC):
+    """A term of the derivative.
+
+    name : what it is, in plans; its seed goes by it.
+    """
+
+    name: str
+
+    @abstractmethod
+    def planned(self, job: Job) -> PlannedTerm:
+        """What it will do."""
+
+    @abstractmethod
+    def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
+        """What makes its film samples, one after the other: nothing is traced before these are called."""
+
+    def plan(self, samples: int, rays: int, why: str, why_not: str) -> PlannedTerm:
+        """samples : 0 if it is left out."""
+        return PlannedTerm(self.name, samples, rays if samples else 0, why if samples else why_not)
