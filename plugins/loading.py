@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling import Geometry, meshes
+from rimlight.edge_sampling import Geometry
+from rimlight.edge_sampling.geometry import meshes
 
 INTEGRATORS = ("direct_edge", "prb_edge", "direct_projective", "prb_projective", "direct", "path", "prb", "prb_basic")
 

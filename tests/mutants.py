@@ -37,11 +37,11 @@ def mutant(fault: str, file: str, *texts: str) -> Mutant:
     return Mutant(fault, file, tuple(zip(texts[::2], texts[1::2], strict=True)))
 
 
-INTEGRATOR = "plugins/integrators/_edge_integrator.py"
-SCATTERING = "plugins/integrators/_scattering.py"
-FILM = "edge_sampling/film_boundary.py"
-SHADOWS = "edge_sampling/shadow_boundary.py"
-SHADING = "edge_sampling/shading_boundary.py"
+INTEGRATOR = "plugins/integrators/edge_integrator.py"
+SCATTERING = "plugins/transport/scattering.py"
+FILM = "edge_sampling/boundaries/film_boundary.py"
+SHADOWS = "edge_sampling/boundaries/shadow_boundary.py"
+SHADING = "edge_sampling/boundaries/shading_boundary.py"
 
 MUTANTS = [
     # ---------------------- A term, 2 % too large ----------------------
@@ -61,7 +61,7 @@ MUTANTS = [
     mutant("edges from points: 2 % too large", SHADING, "return -side * L", "return -1.02 * side * L"),
     mutant(
         "planes of faces: twice as large",
-        "edge_sampling/face_planes.py",
+        "edge_sampling/boundaries/face_planes.py",
         "value += jump * dr.select",
         "value += 2 * jump * dr.select",
     ),
@@ -105,14 +105,14 @@ MUTANTS = [
     ),
     mutant(
         "path replay: one vertex short",
-        "plugins/integrators/_paths.py",
+        "plugins/transport/paths.py",
         "active = self.active & vertex.pi.is_valid() & depths.scatters(vertex.depth)",
         "active = self.active & vertex.pi.is_valid() & depths.scatters(vertex.depth + 1)",
     ),
     # ---------------------- Which edges there are ----------------------
     mutant(
         "edges: not welded",
-        "edge_sampling/edges.py",
+        "edge_sampling/geometry/edges.py",
         "weld = _weld_equal(point)",
         "weld = np.arange(len(point))",
         "rewelded, tolerance = _weld_close(point, weld, face, sides)",
@@ -120,7 +120,7 @@ MUTANTS = [
     ),
     mutant(
         "edges: creases dropped",
-        "edge_sampling/edges.py",
+        "edge_sampling/geometry/edges.py",
         "kind[~interpolated[mesh0]] = EdgeKind.FLAT",
         "kind[~interpolated[mesh0]] = EdgeKind.SMOOTH",
     ),

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.choice.sampling import power_heuristic
-from rimlight.edge_sampling.choice.silhouettes import Silhouettes
+from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic
+from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import View
 from rimlight.edge_sampling.geometry.device_edges import beside_edge, rounding
 from rimlight.edge_sampling.lights import Lights
@@ -83,173 +83,267 @@ class ShadowBoundary:
         """Number of lights."""
         return dr.width(self.chosen)
 
-    def sample(
-        self,
-        tracer: Tracer,
-        sensor: mi.Sensor,
-        sampler: mi.Sampler,
-        *,
-        share: bool,
-    ) -> ShadowSamples:
+    def sample(self, tracer: Tracer, sensor: mi.Sensor, sampler: mi.Sampler, *, share: bool) -> ShadowSamples:
         """Choose points on lights, edges as seen from there, and points on them; one of each for every lane.
 
         The lanes are spread evenly over the lights and, for each, over the edges.
 
         share : are shadows of surfaces sampled from shading points as well?
         """
-        scene, silhouettes, count = tracer.scene, self.silhouettes, sampler.wavefront_size()
+        silhouettes, count = self.silhouettes, sampler.wavefront_size()
         with dr.resume_grad():
             projection = Projection(sensor)
             placement = silhouettes.placement()
         with dr.suspend_grad():
-            # ---------------------- A point on a light ----------------------
-
-            choice = (dr.arange(mi.Float, count) + sampler.next_1d()) * (len(self) / count)
-            which = dr.minimum(mi.UInt32(choice), len(self) - 1)
-            choice = dr.clip(choice - which, 0, dr.one_minus_epsilon(mi.Float))
-            light = dr.gather(mi.UInt32, self.chosen, which)
-            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.lights.emitter, light))
-            time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
-            numbers = sampler.next_2d()
-            on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-            far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) if self.any_other else mi.Bool(False)
-            # At infinity, the place of the point is taken by the direction towards it.
-            it = dr.zeros(mi.SurfaceInteraction3f, count)
-            it.p = mi.Point3f(silhouettes.centre)
-            y, density = mi.Point3f(0), mi.Float(1)
-            n = mi.Vector3f(0)
-            if self.any_other:
-                y = self._off_surface(scene, light, it, far, numbers, ~on_surface)
-            if self.any_surface:
-                ps, _ = emitter.sample_position(time, numbers, on_surface)
-                y, n = dr.select(on_surface, ps.p, y), dr.select(on_surface, mi.Vector3f(ps.n), 0)
-                density = dr.select(on_surface, ps.pdf, 1)
-            active = (density > 0) & dr.isfinite(density)
-
-            # ---------------------- An edge as seen from there ----------------------
-
-            eye = dr.select(far, mi.Vector3f(y), mi.Vector3f(y - silhouettes.centre))
-            view = View(eye, n, dr.full(mi.Float, 1, count), [], far=far if self.any_other else None)
-            # Shadows of edges that stand still matter only on what moves.
-            use = [1, 0.2][: silhouettes.groups]
-            e = silhouettes.sample(placement, view, sampler, use, choice=choice, from_light=True, active=active)
-            active &= e.density > 0
-            outline = silhouettes.point(placement, e, y, far)
-            p = outline.p
-            d = dr.select(far, -mi.Vector3f(y), p - y)
-            ω = dr.normalize(d)
-            cos_y = dr.select(on_surface, dr.dot(n, ω), 1)
-            across = dr.normalize(dr.cross(ω, outline.tangent))
-            lit = across * outline.outward(across)
-            active &= (cos_y > 0) & dr.any(lit != 0)
-
-            # ---------------------- Where its shadow falls ----------------------
-
-            aside = lit * beside_edge(p, dr.select(far, p, y))
-            shadow = mi.Ray3f(p + aside, ω)
-            shadow.time = time
-            fallen = scene.ray_intersect_preliminary(shadow, active=active)
-            active &= fallen.is_valid()
-            # A ray towards the light will start above the surface: from where it starts, it must meet the edge.
-            hit = fallen.compute_surface_interaction(shadow, mi.RayFlags.Minimal, active)
-            facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
-            lift = dr.dot(hit.spawn_ray(-ω).o - hit.p, facing)
-            cos_x = -dr.dot(facing, ω)
-            along = (lift + dr.dot(aside, facing)) / dr.maximum(cos_x, 0.05)
-            x = mi.Point3f(hit.p - aside - ω * along - facing * lift)
-
-            # ---------------------- Does the sensor see it? ----------------------
-
-            aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
-            film_point = projection.film(x, aperture_sample)
-            u = dr.detach(film_point.position())
-            active &= (
-                inside_frame(u, sensor.film()) & (film_point.z > projection.near) & (film_point.z < projection.far)
-            )
-            ray, ray_weight = sensor.sample_ray_differential(
-                time,
-                sampler.next_1d() if mi.is_spectral else 0.0,
-                (u - projection.crop_offset) / projection.crop_size,
-                mi.Point2f(0.5) if aperture_sample is None else aperture_sample,
-                active,
-            )
-            ray = dr.detach(ray)
-            seen = tracer.first_hit(ray, active)
-            active &= seen.is_valid() & (seen.shape == fallen.shape)
-            si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off
-            # it, but less than the ray will start above it.
-            active &= dr.abs_dot(si.n, x - si.p) <= lift + rounding(x, ray.o)
-
-            # ---------------------- What arrives from the light ----------------------
-
-            # From x to the edge, nothing is in the way: that has been seen already.
-            onwards = mi.Ray3f(p + aside, dr.select(far, -ω, dr.normalize(y - p - aside)), time, ray.wavelengths)
-            distance = dr.norm(y - onwards.o)
-            onwards.maxt = dr.select(on_surface | far, dr.largest(mi.Float), distance)
-            met = scene.ray_intersect_preliminary(onwards, active=active)
-            reached = met.is_valid() & (met.shape.emitter() == emitter)
-            reached &= dr.abs_dot(n, onwards(met.t) - y) <= rounding(y, onwards.o)
-            active &= dr.select(on_surface, reached, ~met.is_valid())
-            ω_x, L = mi.Vector3f(0, 0, 1), mi.Spectrum(0)
-            if self.any_other:
-                ds, L = self.lights.sample_direction(scene, light, si, numbers, active & ~on_surface)
-                ω_x = ds.d
-            if self.any_surface:
-                # `path` reckons the geometry of light samples from the surface itself.
-                to_light = y - si.p
-                ω_x = dr.select(on_surface, dr.normalize(to_light), ω_x)
-                emitting = active & on_surface
-                on_light = met.compute_surface_interaction(onwards, mi.RayFlags.All, emitting)
-            f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω_x), active)
-            if self.any_surface:
-                cos, mis = dr.abs_dot(n, ω_x), mi.Float(1)
-                if share or len(self.smooth_lamps):
-                    ds = mi.DirectionSample3f(scene, on_light, si)
-                    light_pdf = scene.pdf_emitter_direction(si, ds, emitting)
-                    mis = power_heuristic(light_pdf, pdf)
-                if len(self.smooth_lamps) and not share:
-                    cos, mis = self.smooth_lamps.cosine(on_light, ω_x, mis), 1
-                Le = emitter.eval(on_light, emitting) * (cos / dr.squared_norm(to_light))
-                L = dr.select(on_surface, Le * mis, L)
-            jump = dr.select(active, f * L * ray_weight, 0)
+            light = self._point_on_light(tracer.scene, sensor, sampler)
+            edge = self._edge(placement, light, sampler)
+            shadow = _fall(tracer.scene, light, edge)
+            view = _look(tracer, projection, sensor, sampler, light.time, shadow)
+            met, jump, active = self._arriving(tracer.scene, light, edge, shadow, view, share=share)
 
             # ---------------------- The boundary on the film ----------------------
 
-            def on_receiver(v):
-                """How the shadow moves on the film if p does by v."""
-                s = dr.select(far, 1, dr.dot(facing, x + facing * lift - y) / dr.dot(facing, d))
-                v = s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))
-                return dr.detach(projection.tangent(x, mi.Point3f(x + v), mi.Float(0), aperture_sample))
-
-            T, towards_light = on_receiver(outline.tangent), on_receiver(lit)
-            n_dl = mi.Vector2f(-T.y, T.x) / (e.density * density * (count / len(self)))
+            tangent, towards_light = (
+                _on_film(v, projection, light, edge, shadow, view) for v in (edge.tangent, edge.lit)
+            )
+            n_dl = mi.Vector2f(-tangent.y, tangent.x) / (edge.sample.density * light.density * (count / len(self)))
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl = dr.select(active, n_dl, 0)
-            u = dr.select(active, u, 0)  # what is not finite would spoil pixels, even with the value 0
+            u = dr.select(active, view.u, 0)  # what is not finite would spoil pixels, even with the value 0
             if projection.attached:
                 # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
-                dr.eval(jump, n_dl, active, seen, ray, met, onwards, light, numbers, e, y, far, facing, lift, u)
+                dr.eval(jump, n_dl, active, view, met, light, edge, shadow, u)
 
         with dr.resume_grad():
-            p = silhouettes.point(placement, e, y, far).p
-            q = mi.Point3f(0)
-            if self.any_other:
-                q = self._off_surface(scene, light, it, far, numbers, active & ~on_surface)
-            if self.any_surface:
-                q = dr.select(on_surface, material_point(onwards, met, active & on_surface).p, q)
-            m = material_point(ray, seen, active).p
+            p = silhouettes.point(placement, edge.sample, light.y, light.far).p
+            q = self._follow(tracer.scene, light, shadow.onwards, met, active)
+            m = material_point(view.ray, view.seen, active).p
             # From the light past the edge to the plane in which the shadow falls. (Its turning is of second order.)
-            d = dr.select(far, -mi.Vector3f(q), p - q)
-            origin = dr.select(far, p, q)
-            s = (dr.dot(facing, m - origin) + lift) / dr.dot(facing, d)
-            x = mi.Point3f(origin + dr.select(active, s, 1) * d - facing * lift)
-            moved = projection.film(x, aperture_sample).position()
+            d = dr.select(light.far, -mi.Vector3f(q), p - q)
+            origin = dr.select(light.far, p, q)
+            s = (dr.dot(shadow.facing, m - origin) + shadow.lift) / dr.dot(shadow.facing, d)
+            x = mi.Point3f(origin + dr.select(active, s, 1) * d - shadow.facing * shadow.lift)
+            moved = projection.film(x, view.aperture_sample).position()
             value = jump * dr.dot(n_dl, dr.select(active, moved - dr.detach(moved), 0))
-            return ShadowSamples(u, value, ray.wavelengths, light)
+            return ShadowSamples(u, value, view.ray.wavelengths, light.light)
 
-    def _off_surface(self, scene, light, it, far, numbers, active) -> mi.Point3f:
+    # ---------------------- From a light to an edge ----------------------
+
+    def _point_on_light(self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler) -> _LightPoint:
+        count = sampler.wavefront_size()
+        choice = (dr.arange(mi.Float, count) + sampler.next_1d()) * (len(self) / count)
+        which = dr.minimum(mi.UInt32(choice), len(self) - 1)
+        choice = dr.clip(choice - which, 0, dr.one_minus_epsilon(mi.Float))
+        light = dr.gather(mi.UInt32, self.chosen, which)
+        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.lights.emitter, light))
+        time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
+        numbers = sampler.next_2d()
+        on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+        far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) if self.any_other else mi.Bool(False)
+        y, density = mi.Point3f(0), mi.Float(1)
+        n = mi.Vector3f(0)
+        if self.any_other:
+            y = self._off_surface(scene, light, far, numbers, ~on_surface)
+        if self.any_surface:
+            ps, _ = emitter.sample_position(time, numbers, on_surface)
+            y, n = dr.select(on_surface, ps.p, y), dr.select(on_surface, mi.Vector3f(ps.n), 0)
+            density = dr.select(on_surface, ps.pdf, 1)
+        return _LightPoint(light, emitter, choice, time, numbers, on_surface, far, y, n, density)
+
+    def _off_surface(self, scene: mi.Scene, light, far, numbers, active) -> mi.Point3f:
         """Where lights are that are no surfaces; at infinity, in which direction."""
+        it = dr.zeros(mi.SurfaceInteraction3f, dr.width(numbers))
+        it.p = mi.Point3f(self.silhouettes.centre)
         ds, _ = self.lights.sample_direction(scene, light, it, numbers, active)
         return dr.select(far, mi.Point3f(ds.d), ds.p)
+
+    def _follow(self, scene: mi.Scene, light: _LightPoint, onwards, met, active) -> mi.Point3f:
+        """The point of the light, attached to its motion. onwards, met : a ray that meets it."""
+        q = mi.Point3f(0)
+        if self.any_other:
+            q = self._off_surface(scene, light.light, light.far, light.numbers, active & ~light.on_surface)
+        if self.any_surface:
+            q = dr.select(light.on_surface, material_point(onwards, met, active & light.on_surface).p, q)
+        return q
+
+    def _edge(self, placement: Placement, light: _LightPoint, sampler: mi.Sampler) -> _Edge:
+        """An edge as the light sees it."""
+        silhouettes, far, y = self.silhouettes, light.far, light.y
+        eye = dr.select(far, mi.Vector3f(y), mi.Vector3f(y - silhouettes.centre))
+        one = dr.full(mi.Float, 1, dr.width(light.choice))
+        view = View(eye, light.n, one, [], far=far if self.any_other else None)
+        active = (light.density > 0) & dr.isfinite(light.density)
+        # Shadows of edges that stand still matter only on what moves.
+        use = [1, 0.2][: silhouettes.groups]
+        e = silhouettes.sample(placement, view, sampler, use, choice=light.choice, from_light=True, active=active)
+        outline = silhouettes.point(placement, e, y, far)
+        d = dr.select(far, -mi.Vector3f(y), outline.p - y)
+        ω = dr.normalize(d)
+        across = dr.normalize(dr.cross(ω, outline.tangent))
+        lit = across * outline.outward(across)
+        emits = dr.select(light.on_surface, dr.dot(light.n, ω), 1) > 0
+        return _Edge(e, outline.p, outline.tangent, lit, d, ω, active & (e.density > 0) & emits & dr.any(lit != 0))
+
+    # ---------------------- What arrives where the shadow falls ----------------------
+
+    def _arriving(
+        self, scene: mi.Scene, light: _LightPoint, edge: _Edge, shadow: _Shadow, view: _View, *, share: bool
+    ) -> tuple[mi.PreliminaryIntersection3f, mi.Spectrum, mi.Bool]:
+        """What a ray to the light meets; the radiance that the sensor sees of this light beside the shadow, and is it
+        there?"""
+        si, y, n, on_surface = view.si, light.y, light.n, light.on_surface
+        # From x to the edge, nothing is in the way: that has been seen already.
+        onwards = shadow.onwards
+        onwards.wavelengths = view.ray.wavelengths
+        distance = dr.norm(y - onwards.o)
+        onwards.maxt = dr.select(on_surface | light.far, dr.largest(mi.Float), distance)
+        met = scene.ray_intersect_preliminary(onwards, active=view.active)
+        reached = met.is_valid() & (met.shape.emitter() == light.emitter)
+        reached &= dr.abs_dot(n, onwards(met.t) - y) <= rounding(y, onwards.o)
+        active = view.active & dr.select(on_surface, reached, ~met.is_valid())
+        ω_x, L = mi.Vector3f(0, 0, 1), mi.Spectrum(0)
+        if self.any_other:
+            ds, L = self.lights.sample_direction(scene, light.light, si, light.numbers, active & ~on_surface)
+            ω_x = ds.d
+        if self.any_surface:
+            # `path` reckons the geometry of light samples from the surface itself.
+            to_light = y - si.p
+            ω_x = dr.select(on_surface, dr.normalize(to_light), ω_x)
+            emitting = active & on_surface
+            on_light = met.compute_surface_interaction(onwards, mi.RayFlags.All, emitting)
+        f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω_x), active)
+        if self.any_surface:
+            cos, mis = dr.abs_dot(n, ω_x), mi.Float(1)
+            if share or len(self.smooth_lamps):
+                ds = mi.DirectionSample3f(scene, on_light, si)
+                light_pdf = scene.pdf_emitter_direction(si, ds, emitting)
+                mis = power_heuristic(light_pdf, pdf)
+            if len(self.smooth_lamps) and not share:
+                cos, mis = self.smooth_lamps.cosine(on_light, ω_x, mis), 1
+            Le = light.emitter.eval(on_light, emitting) * (cos / dr.squared_norm(to_light))
+            L = dr.select(on_surface, Le * mis, L)
+        return met, dr.select(active, f * L * view.weight, 0), active
+
+
+# ---------------------- Stations of a sample ----------------------
+
+
+@dataclass
+class _LightPoint:
+    """A point of a light; at infinity, y is the direction towards it.
+
+    n : normal, 0 where the light is no surface. density : of y, by area. choice : what is left of a random number.
+    """
+
+    light: mi.UInt32
+    emitter: mi.EmitterPtr
+    choice: mi.Float
+    time: mi.Float
+    numbers: mi.Point2f
+    on_surface: mi.Bool
+    far: mi.Bool
+    y: mi.Point3f
+    n: mi.Vector3f
+    density: mi.Float
+
+
+@dataclass
+class _Edge:
+    """A point p of an edge as the light sees it, with the tangent there.
+
+    lit : unit vector across edge and light, towards the lit side. d, ω : from the light to p, ω of unit length.
+    """
+
+    sample: EdgeSample
+    p: mi.Point3f
+    tangent: mi.Vector3f
+    lit: mi.Vector3f
+    d: mi.Vector3f
+    ω: mi.Vector3f
+    active: mi.Bool
+
+
+@dataclass
+class _Shadow:
+    """Where the shadow of that point falls.
+
+    x : mi.Point3f, a little off the surface. facing : its normal, on the side of the light. lift : how high above it
+    rays start. shape : of the surface. onwards : a ray past the edge to the light.
+    """
+
+    x: mi.Point3f
+    facing: mi.Vector3f
+    lift: mi.Float
+    shape: mi.ShapePtr
+    onwards: mi.Ray3f
+    active: mi.Bool
+
+
+@dataclass
+class _View:
+    """The shadow as the sensor sees it: at the position u of the film, in pixels."""
+
+    u: mi.Point2f
+    ray: mi.RayDifferential3f
+    weight: mi.Spectrum
+    seen: mi.PreliminaryIntersection3f
+    si: mi.SurfaceInteraction3f
+    aperture_sample: mi.Point2f | None
+    active: mi.Bool
+
+
+def _fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
+    p, ω, far = edge.p, edge.ω, light.far
+    aside = edge.lit * beside_edge(p, dr.select(far, p, light.y))
+    ray = mi.Ray3f(p + aside, ω)
+    ray.time = light.time
+    fallen = scene.ray_intersect_preliminary(ray, active=edge.active)
+    active = edge.active & fallen.is_valid()
+    # A ray towards the light will start above the surface: from where it starts, it must meet the edge.
+    hit = fallen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+    facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
+    lift = dr.dot(hit.spawn_ray(-ω).o - hit.p, facing)
+    cos_x = -dr.dot(facing, ω)
+    along = (lift + dr.dot(aside, facing)) / dr.maximum(cos_x, 0.05)
+    x = mi.Point3f(hit.p - aside - ω * along - facing * lift)
+    towards_light = dr.select(far, -ω, dr.normalize(light.y - p - aside))
+    onwards = mi.Ray3f(p + aside, towards_light, light.time, ray.wavelengths)
+    return _Shadow(x, facing, lift, fallen.shape, onwards, active)
+
+
+def _look(
+    tracer: Tracer, projection: Projection, sensor: mi.Sensor, sampler: mi.Sampler, time: mi.Float, shadow: _Shadow
+) -> _View:
+    """Does the sensor see it?"""
+    x = shadow.x
+    aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
+    film_point = projection.film(x, aperture_sample)
+    u = dr.detach(film_point.position())
+    in_depth = (film_point.z > projection.near) & (film_point.z < projection.far)
+    active = shadow.active & inside_frame(u, sensor.film()) & in_depth
+    ray, weight = sensor.sample_ray_differential(
+        time,
+        sampler.next_1d() if mi.is_spectral else 0.0,
+        (u - projection.crop_offset) / projection.crop_size,
+        mi.Point2f(0.5) if aperture_sample is None else aperture_sample,
+        active,
+    )
+    ray = dr.detach(ray)
+    seen = tracer.first_hit(ray, active)
+    active &= seen.is_valid() & (seen.shape == shadow.shape)
+    si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off it, but
+    # less than the ray will start above it.
+    active &= dr.abs_dot(si.n, x - si.p) <= shadow.lift + rounding(x, ray.o)
+    return _View(u, ray, weight, seen, si, aperture_sample, active)
+
+
+def _on_film(
+    v: mi.Vector3f, projection: Projection, light: _LightPoint, edge: _Edge, shadow: _Shadow, view: _View
+) -> mi.Vector2f:
+    """How the shadow moves on the film if the point of the edge moves by v: pixels."""
+    x, facing, d = shadow.x, shadow.facing, edge.d
+    s = dr.select(light.far, 1, dr.dot(facing, x + facing * shadow.lift - light.y) / dr.dot(facing, d))
+    v = s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))
+    return dr.detach(projection.tangent(x, mi.Point3f(x + v), mi.Float(0), view.aperture_sample))

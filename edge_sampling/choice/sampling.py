@@ -192,9 +192,10 @@ def _renewed(choice: mi.Float, density: mi.Float, sampler: mi.Sampler, active: m
 
 
 def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
-    """Weight of a strategy with density a against one with density b (Veach 1997, Eq. 9.13, with β = 2)."""
-    a2, b2 = dr.square(a), dr.square(b)
-    return dr.select(a2 > 0, a2 / (a2 + b2), 0)
+    """Weight of a strategy with density a against one with density b (Veach 1997, Eq. 9.13, with β = 2). Detached."""
+    a2, b2 = dr.square(dr.detach(a)), dr.square(dr.detach(b))
+    weight = a2 / (a2 + b2)
+    return dr.select(dr.isfinite(weight), weight, 0)
 
 
 def stratified(sampler: mi.Sampler, seed: mi.UInt32 | int) -> mi.Float:

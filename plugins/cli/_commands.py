@@ -2,173 +2,25 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import UseAppendAction, arg
 
 import rimlight
 from rimlight import pictures
-from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image, finite_differences
+from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
 from rimlight.exr import write_exr
-from rimlight.loading import InputError, expected, load_integrator, load_scene, use_variant
+from rimlight.loading import InputError, expected, load_integrator, use_variant
 
 from . import _loading
 from ._loading import at_least
-
-#: Samples of one launch. More are split, so that a progress bar can move and an interruption is heard.
-MAX_SAMPLES = 2**20
-
-#: Samples of one launch that finite differences may ask for: memory for the state of their sampler is needed at once.
-MAX_REFERENCE_SAMPLES = 2**28
-
-#: Texts of refusals by our own integrators ("who: what"); other RuntimeErrors are bugs.
-REFUSAL = r"^[\w ]+: "
-
-Numbers = Annotated[str | None, arg(metavar="X,Y,Z")]
-
-
-# ------------------------------------------------------------------ shared options
-
-
-@dataclass(frozen=True, kw_only=True)
-class _OnScene:
-    scene: Annotated[Positional[Path], arg(metavar="SCENE.XML")]
-    """Scene file of Mitsuba 3."""
-    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=["-D"], metavar="KEY=VALUE")] = ()
-    """Parameter of the scene file, such as res=128."""
-    variant: str = "llvm_ad_rgb"
-    """Variant of Mitsuba."""
-
-    def load(self) -> Any:
-        use_variant(self.variant)
-        return load_scene(self.scene, self.define)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _OnSensor(_OnScene):
-    sensor: int = 0
-    """Number of the sensor."""
-    seed: int = 0
-    """Seed of the random numbers."""
-
-    def load(self) -> Any:
-        at_least(0, sensor=self.sensor, seed=self.seed)
-        scene = super().load()
-        if self.sensor >= len(scene.sensors()):
-            raise InputError(
-                f"--sensor: the scene has {len(scene.sensors())} sensors, there is no number {self.sensor}"
-            )
-        return scene
-
-    def pixels(self, scene: Any) -> int:
-        return int(np.prod(scene.sensors()[self.sensor].film().crop_size()))
-
-    def metadata(self, **more: Any) -> dict[str, Any]:
-        versions = {"rimlight": rimlight.__version__, "mitsuba": mi.__version__, "drjit": dr.__version__}
-        return {"scene": self.scene, "define": " ".join(self.define), "variant": self.variant, **versions, **more}
-
-
-@dataclass(frozen=True, kw_only=True)
-class _OnMotion(_OnSensor):
-    param: Annotated[str | None, arg(metavar="KEY")] = None
-    """Parameter that moves; `rimlight params` lists them."""
-    camera: Literal["translate", "rotate"] | None = None
-    """Move the camera instead."""
-    direction: Numbers = None
-    """Displacement per unit of θ, world space. For colours etc.: as many numbers as the parameter has, or one."""
-    rotate: Numbers = None
-    """Axis of a rotation, world space; θ in radians."""
-    pivot: Numbers = None
-    """Point on that axis (default: the mean of the vertices, or the origin of what moves)."""
-    vertices: Annotated[str | None, arg(metavar="I,J,...")] = None
-    """Only these vertices move."""
-
-    def load_motion(self, scene: Any) -> Motion:
-        return _loading.load_motion(
-            scene,
-            param=self.param,
-            camera=self.camera,
-            direction=self.direction,
-            rotate=self.rotate,
-            pivot=self.pivot,
-            vertices=self.vertices,
-            sensor=self.sensor,
-        )
-
-    def reference(
-        self, scene: Any, motion: Motion, *, step: float, runs: int, spp: int, max_depth: int
-    ) -> FiniteDifferences:
-        most = MAX_REFERENCE_SAMPLES // self.pixels(scene)
-        if spp > most:
-            raise InputError(
-                f"finite differences: {spp} spp of this film exceed the limit of {most}; use more --runs instead"
-            )
-        with expected(ValueError, pattern=REFUSAL):
-            return finite_differences(
-                scene,
-                motion,
-                step=step,
-                runs=runs,
-                spp=spp,
-                max_depth=max_depth,
-                sensor=self.sensor,
-                seed=self.seed,
-                progress=sys.stderr.isatty(),
-            )
-
-
-# ------------------------------------------------------------------ work
-
-
-def _seeds(spp: int, pixels: int, first: int) -> list[tuple[int, int]]:
-    """(seed, spp) of the launches that make up `spp`."""
-    count = -(-spp * pixels // MAX_SAMPLES)
-    count = min(count, spp)
-    return [(first + i, spp // count + (i < spp % count)) for i in range(count)]
-
-
-def _accumulate(render: Callable[[int, int], Any], launches: list[tuple[int, int]], label: str) -> np.ndarray:
-    """Mean of `render(seed, spp)` over the launches, weighted by spp: (H, W, C), float32."""
-    total = np.float64(0)
-    with _progress(launches, label) as bar:
-        for seed, spp in bar:
-            with expected(RuntimeError, pattern=REFUSAL), rimlight.no_collection():
-                total = total + spp * np.array(render(seed, spp), np.float64)
-    image = (total / sum(spp for _, spp in launches)).astype(np.float32)
-    if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-        raise InputError(
-            f"the film or integrator makes images of shape {image.shape}; 1, 3 or 4 channels are supported"
-        )
-    return image
-
-
-def _progress(items: list[Any], label: str) -> Any:
-    """A bar on a terminal, after half a second; nothing elsewhere."""
-    return tqdm(items, desc=label, leave=False, delay=0.5, disable=None)
-
-
-@contextmanager
-def _writing() -> Iterator[None]:
-    with expected(OSError, who="--out"):
-        yield
-
-
-def _write_image(stem: Path, image: np.ndarray, metadata: dict[str, Any]) -> None:
-    write_exr(stem.with_suffix(".exr"), {"": image}, metadata)
-    pictures.write_image(stem.with_suffix(".png"), image)
-
-
-# ------------------------------------------------------------------ commands
+from ._shared import REFUSAL, OnMotion, OnScene, OnSensor, accumulate, progress, seeds, write_image, writing
 
 
 @dataclass(frozen=True)
@@ -183,7 +35,7 @@ class SysInfo:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Params(_OnScene):
+class Params(OnScene):
     """List the parameters of a scene that can be differentiated: ∂, and D where they move edges."""
 
     def run(self) -> int:
@@ -198,7 +50,7 @@ class Params(_OnScene):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanCommand(_OnSensor):
+class PlanCommand(OnSensor):
     """Print what a derivative needs: which terms, of how many edges, at what cost."""
 
     param: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KEY")] = ()
@@ -225,7 +77,7 @@ class PlanCommand(_OnSensor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(_OnSensor):
+class Render(OnSensor):
     """Render a scene to an EXR and a PNG file."""
 
     out: Path
@@ -242,22 +94,22 @@ class Render(_OnSensor):
         scene = self.load()
         integrator = load_integrator(self.integrator)
         start = time.perf_counter()
-        image = _accumulate(
+        image = accumulate(
             lambda seed, spp: mi.render(scene, integrator=integrator, sensor=self.sensor, spp=spp, seed=seed),
-            _seeds(self.spp, self.pixels(scene), self.seed),
+            seeds(self.spp, self.pixels(scene), self.seed),
             "render",
         )
         metadata = self.metadata(
             integrator=self.integrator, spp=self.spp, seed=self.seed, seconds=f"{time.perf_counter() - start:.3f}"
         )
         folder = _loading.make_folder(self.out.parent if to_file else self.out)
-        with _writing():
-            _write_image(folder / (self.out.stem if to_file else "image"), image, metadata)
+        with writing():
+            write_image(folder / (self.out.stem if to_file else "image"), image, metadata)
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gradient(_OnMotion):
+class Gradient(OnMotion):
     """Render the derivative of an image with respect to a motion, and the image."""
 
     out: Path
@@ -273,16 +125,16 @@ class Gradient(_OnMotion):
         scene = self.load()
         integrator = load_integrator(self.integrator)
         motion = self.load_motion(scene)
-        launches = _seeds(self.spp, self.pixels(scene), self.seed)
+        launches = seeds(self.spp, self.pixels(scene), self.seed)
 
         start = time.perf_counter()
-        derivative = _accumulate(
+        derivative = accumulate(
             lambda seed, spp: derivative_image(scene, integrator, motion, sensor=self.sensor, spp=spp, seed=seed),
             launches,
             "derivative",
         )
         seconds = time.perf_counter() - start
-        image = _accumulate(
+        image = accumulate(
             lambda seed, spp: mi.render(scene, integrator=integrator, sensor=self.sensor, spp=spp, seed=seed),
             launches,
             "image",
@@ -291,8 +143,8 @@ class Gradient(_OnMotion):
         what = str(motion)
         metadata = self.metadata(integrator=self.integrator, spp=self.spp, seed=self.seed, seconds=f"{seconds:.3f}")
         folder = _loading.make_folder(self.out)
-        with _writing():
-            _write_image(folder / "image", image, metadata)
+        with writing():
+            write_image(folder / "image", image, metadata)
             moved = {"key": motion.key, "motion": what, "unit": motion.unit}
             write_exr(folder / "derivative.exr", {"": derivative}, {**metadata, **moved})
             pictures.write_derivative(folder / "derivative.png", derivative, title=what, unit=motion.unit)
@@ -300,7 +152,7 @@ class Gradient(_OnMotion):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FiniteDifferencesCommand(_OnMotion):
+class FiniteDifferencesCommand(OnMotion):
     """Render a reference derivative by central differences of Mitsuba's `path`."""
 
     out: Path
@@ -327,13 +179,13 @@ class FiniteDifferencesCommand(_OnMotion):
         )
         seconds = f"{time.perf_counter() - start:.3f}"
         _loading.make_folder(self.out.parent)
-        with _writing():
+        with writing():
             reference.write(self.out, self.metadata(motion=str(motion), key=motion.key, seconds=seconds))
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(_OnMotion):
+class Check(OnMotion):
     """Compare a derivative with finite differences. Exit code 1 where they disagree by more than their noise."""
 
     step: float
@@ -390,21 +242,21 @@ class Check(_OnMotion):
         print("result              " + (f"DISAGREE: {'; '.join(faults)}" if faults else "agree, within their noise"))
         if self.out:
             _loading.make_folder(self.out.parent)
-            with _writing():
+            with writing():
                 self._write_panels(what, motion.unit, derivatives.mean(0), reference, agreement)
         return 1 if faults else 0
 
     def _derivatives(self, scene: Any, integrator: Any, motion: Motion) -> np.ndarray:
         """One for each seed: (N, H, W, C)."""
         renders = []
-        with _progress(list(range(self.seeds)), "derivative") as bar:
+        with progress(list(range(self.seeds)), "derivative") as bar:
             for k in bar:
-                launches = _seeds(self.spp, self.pixels(scene), self.seed)
+                launches = seeds(self.spp, self.pixels(scene), self.seed)
                 launches = [(seed + k * len(launches), spp) for seed, spp in launches]
                 render = lambda seed, spp: derivative_image(
                     scene, integrator, motion, sensor=self.sensor, spp=spp, seed=seed
                 )
-                renders.append(_accumulate(render, launches, "launch"))
+                renders.append(accumulate(render, launches, "launch"))
         return np.array(renders)
 
     def _write_panels(
@@ -431,7 +283,7 @@ class Demo:
 
         _loading.check_output(self.out, folder=True)
         use_variant("llvm_ad_rgb")
-        with _writing():
+        with writing():
             demo.main(self.out)
         return 0
 

@@ -17,8 +17,8 @@ from rimlight import inverse
 from rimlight.inverse import Free, Problem
 from rimlight.loading import InputError, expected
 
-from ._commands import REFUSAL
 from ._loading import at_least, check_output
+from ._shared import REFUSAL
 
 #: What is shown by --help before there is a file.
 EXAMPLE = Problem(scene=Path("scene.xml"), free=(Free(key=("shape.vertex_positions",), kind="pose"),))

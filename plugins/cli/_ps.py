@@ -15,8 +15,8 @@ from rimlight.exr import read_exr
 from rimlight.inverse.photometric_stereo import calibration, dataset, output, reconstruction, report, simulation
 from rimlight.loading import InputError, expected, use_variant
 
-from ._commands import REFUSAL
 from ._loading import at_least, check_output
+from ._shared import REFUSAL
 
 #: Bytes of memory for each value, which is that of a pixel in an image: of reading, and of a reconstruction. Measured.
 READING, RECONSTRUCTION = 40, 125

@@ -14,8 +14,8 @@ from rimlight import ggx, merl_tables
 from rimlight.inverse import reflectance
 from rimlight.loading import InputError, expected
 
-from ._commands import REFUSAL
 from ._loading import at_least, check_output
+from ._shared import REFUSAL
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -139,7 +139,7 @@ class BoundarySearch:
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
         soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
         film = FilmBoundary(self.geometry, self.edges, on_film, lights, soft=soft) if on_film.any() else None
-        film = film if film is not None and any(film.counts) else None
+        film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading = self._in_reflected_light(scene, moving, sppi)
         abilities = {"planes": self.planes, "from_points": self.from_points}

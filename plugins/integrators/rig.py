@@ -12,8 +12,9 @@ from rimlight.terms.sampling import in_a_row, over_film, seed_of
 
 from ._finite import report_gradients, report_image
 from ._layers import Layers, LayerSamples
-from ._light_paths import Backward, Forward, LightPaths, Measure, Splat
+from ._light_paths import LightPaths
 from ._options import is_whole
+from ._sinks import Backward, Forward, Measure, Splat
 from .edge_integrator import EdgeIntegrator
 
 #: Longest path. A derivative keeps all of its vertices in memory.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.python.ad.integrators.common import mis_weight
 
+from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below
 from rimlight.edge_sampling.parametrisation import Parametrisation, shown_by_mirror
 
@@ -92,7 +92,7 @@ class Scattering:
             active &= visible
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
-            mis = mis_weight(ds.pdf, pdf)
+            mis = power_heuristic(ds.pdf, pdf)
             if len(self.held.smooth_lamps) and to_lamp is not None:
                 mis = to_lamp.attach(mis, ds.pdf, pdf, by_light=True)
             mis = dr.select(ds.delta | self._found_by_light_samples(ds), 1, mis)
@@ -179,7 +179,7 @@ class Scattering:
         ds = mi.DirectionSample3f(scene, y, si)
         pdf = self.pdf_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
         with dr.resume_grad(when=self.attached):
-            mis = mis_weight(bs.pdf, pdf)
+            mis = power_heuristic(bs.pdf, pdf)
             if len(self.held.smooth_lamps) and self.attached:
                 bsdf_pdf = bsdf.pdf(context, si, si.to_local(ω), active & ~mirrored)
                 mis = to_y.attach(mis, bsdf_pdf, pdf, by_light=False)

@@ -158,7 +158,7 @@ def equal_time_picture(settings: Settings, folder: Path) -> dict[str, Any]:
     panels.append(Panel(problem.truth, "mean of many renders", "derivative"))
     limit = symmetric_limit([problem.truth], 99)
     write_panels(folder / "glossy_choice.png", panels, unit="scene unit", limit=limit)
-    edges = len(problem.integrators[OURS]._edges)
+    edges = len(problem.integrators[OURS].search.edges)
     noise = np.sqrt(2 / np.pi) * error.sum() / np.abs(problem.truth).sum()
     return {"choices": found, "edges": edges, "truth_error": noise}
 

@@ -3,7 +3,7 @@
 `exact` is checked on charts: one scene with a cell of the film for each row, whose derivative is compared with finite
 differences cell by cell; or it names cases of `test_derivatives.py`. `warned` and `refused` are checked by the message.
 To add a row: a line in the document, and an entry in `CELLS`, `MESSAGES` or `ELSEWHERE`. Finite differences are stored;
-``RENEW_REFERENCES=1 python -m pytest tests/test_support.py`` makes them anew (a few minutes).
+``RENEW_REFERENCES=1 python -m pytest tests/plugins/integrators/test_support.py`` makes them anew (a few minutes).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from rimlight.checks import (
 )
 from rimlight.edge_sampling import EdgeKind, Geometry, find_edges, jumping_textures
 
-DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "support.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "support.md"
 WORDS = ("exact", "warned", "refused", "silent", "untested", "—")
 COLUMNS = {"moves": "moves", "changes": "changes", "is passed": "passed", "sees something move": "passed"}
 

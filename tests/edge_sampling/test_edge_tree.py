@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
+from meshes import bumpy_sphere
 from scipy.stats import chisquare
 
 from rimlight.edge_sampling import Edges, Geometry, find_edges
@@ -18,20 +18,6 @@ from rimlight.edge_sampling.choice.sampling import resample, sample_edge
 from rimlight.edge_sampling.choice.views import Cone, Lobe, View
 
 # ---------------------- Meshes and trees ----------------------
-
-
-def bumpy_sphere(points: int, bumps: float = 0.15, normals: bool = True, centre=(0, 0, 0)) -> mi.Mesh:
-    """A closed mesh of radius about 1, with 3 · `points` − 6 edges of about the same length."""
-    i = np.arange(points) + 0.5
-    height, longitude = 1 - 2 * i / points, np.pi * (1 + 5**0.5) * i
-    radius = np.sqrt(1 - height**2)
-    p = np.stack([radius * np.cos(longitude), height, radius * np.sin(longitude)], 1)
-    faces = ConvexHull(p).simplices
-    a, b, c = (p[faces[:, k]] for k in range(3))
-    inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
-    faces[inwards] = faces[inwards][:, ::-1]
-    p *= 1 + bumps * np.sin(5 * p[:, :1] + 1) * np.cos(4 * p[:, 1:2]) * np.cos(6 * p[:, 2:])
-    return cases.mesh("bumpy", p + np.array(centre), faces, normals)
 
 
 def still_life() -> tuple[mi.Mesh, ...]:

@@ -11,11 +11,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from meshes import bumpy_sphere
 from random_scenes import torus
-from test_edge_tree import bumpy_sphere
 
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import Geometry, ShadingBoundary, Silhouettes, find_edges
+from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
+from rimlight.transport import PathTracer
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
 SIDE = [1, 0.3, 0.2]
@@ -226,7 +228,11 @@ def test_points_on_the_lines_of_edges():
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(x) * count)
     placement = silhouettes.placement()
-    L = shading.from_points(scene, placement, si, sampler, sampler.next_1d(), mi.Bool(True), share_emission=False)
+    integrator = mi.load_dict({"type": "prb_edge", "max_depth": 3})
+    # Beyond the first vertex, where diffuse surfaces do not leave emitted light to `ShadowBoundary`.
+    depth, β = dr.full(mi.UInt32, 2, len(x) * count), dr.ones(mi.Spectrum, len(x) * count)
+    point = ShadingPoint(si, depth, β, mi.Bool(True))
+    L = shading.sample(PathTracer(scene, integrator), placement, point, sampler, sampler.next_1d())
     derivative = np.array(dr.forward_to(L, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
     assert np.isfinite(derivative).all()
     seen = (derivative.reshape(3, len(x), count) != 0).any((0, 2))

@@ -260,7 +260,7 @@ def test_many_samples_are_split(tmp_path, monkeypatch):
     """Launches with different seeds add up to the mean that one launch has, within the noise."""
     options = ["gradient", TRIANGLES, *SMALL, *MOVE, "--spp", "100", "--out"]
     assert main([*options, str(tmp_path / "one")]) == 0
-    monkeypatch.setattr("rimlight.cli._commands.MAX_SAMPLES", 16 * 16 * 7)
+    monkeypatch.setattr("rimlight.cli._shared.MAX_SAMPLES", 16 * 16 * 7)
     assert main([*options, str(tmp_path / "many")]) == 0
     one, many = (read_exr(tmp_path / name / "derivative.exr")[0][""] for name in ("one", "many"))
     assert 0 < np.abs(one - many).sum() < 0.2 * np.abs(one).sum()
@@ -311,7 +311,7 @@ def test_interruption_leaves_nothing(capfd, tmp_path, monkeypatch):
         return derivative_image(*arguments, seed=seed, **options)
 
     monkeypatch.setattr("rimlight.cli._commands.derivative_image", interrupted)
-    monkeypatch.setattr("rimlight.cli._commands.MAX_SAMPLES", 16 * 16)
+    monkeypatch.setattr("rimlight.cli._shared.MAX_SAMPLES", 16 * 16)
     assert main(["gradient", TRIANGLES, *SMALL, *MOVE, "--spp", "4", "--out", str(tmp_path / "out")]) == 130
     assert capfd.readouterr().err.splitlines()[-1] == "rimlight: interrupted"
     assert seeds == [0, 1, 2]

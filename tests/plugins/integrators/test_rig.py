@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_freezing import STEPS, Step, assert_same, losses_and_gradients, numbers
+from frozen import STEPS, Step, assert_same, losses_and_gradients, numbers
 
 from rimlight.checks import Motion, compare, derivative_image, mean_and_error, z_scores
 from rimlight.exr import read_exr, read_layers, write_exr, write_layers

@@ -1,0 +1,268 @@
+"""All that can be an outline on the film: where it is, and how long it seems."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rimlight.edge_sampling.geometry.curves import CurvePoint, Curves
+from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
+from rimlight.edge_sampling.geometry.edges import Edges
+from rimlight.edge_sampling.geometry.meshes import Geometry
+from rimlight.edge_sampling.projection.sensors import Projection
+
+from .horizon import HorizonPoint, Horizons
+
+#: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
+#: an edge that cannot be seen changes nothing, not even the last bit.
+LENGTH_UNIT = 2.0**-16
+
+
+@dataclass
+class Placed:
+    """Where the outlines are, and how the sensor sees them; attached. aperture_sample : a point of the lens."""
+
+    projection: Projection
+    positions: mi.Float
+    frames: mi.Float | None
+    normals: mi.Float | None
+    aperture_sample: mi.Point2f | None = None
+
+
+@dataclass
+class Chosen:
+    """An edge, a cut, a horizon or a piece of a curve for each sample.
+
+    index : mi.UInt32, (N,), among all of these.
+    along : mi.Float, position along its visible part, uniform in [0, 1) on the film.
+    density : mi.Float, expected number of samples on it; 0 where none is visible.
+    edge, face, piece : its number among those of its kind; 0 where it is of another.
+    """
+
+    index: mi.UInt32
+    along: mi.Float
+    density: mi.Float
+    is_edge: mi.Bool
+    is_line: mi.Bool
+    is_horizon: mi.Bool
+    is_curve: mi.Bool
+    edge: mi.UInt32
+    face: mi.UInt32
+    piece: mi.UInt32
+
+
+@dataclass
+class Found:
+    """What is known of the points. Detached.
+
+    along_film : mi.Vector2f, tangent on the film, by the fraction that was sampled: pixels. valid : is there one?
+    t : parameter on an edge or a cut. eye : from where curves are seen. curve : the points on these.
+    facing : mi.Vector2f, on the film, towards where normals face the viewer.
+    """
+
+    along_film: mi.Vector2f
+    valid: mi.Bool
+    t: mi.Float | None = None
+    eye: mi.Point3f | None = None
+    curve: CurvePoint | None = None
+    facing: mi.Vector2f | None = None
+
+
+class FilmOutlines:
+    """The edges of meshes, the cuts of the near clipping plane through their faces, the horizons of interpolated
+    normals, and the curves of analytic shapes.
+
+    Parameters
+    ----------
+    geometry, edges, moving, soft : see `FilmBoundary`.
+    """
+
+    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "horizons", "curves", "counts", "soft"))  # for `dr.freeze`
+
+    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool):
+        self.geometry, self.soft = geometry, soft
+        edges, faces = edges.of_meshes(moving), geometry.faces(moving)
+        # (Dr.Jit 1.5 cannot freeze empty arrays.)
+        self.edges = DeviceEdges(edges) if len(edges) else None
+        self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
+        shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
+        shapes = tuple(s for s, moves in shapes if moves)
+        self.curves = Curves(shapes) if shapes else None
+        horizons = Horizons(geometry, moving[: len(geometry.meshes)])
+        self.horizons = horizons if len(horizons) else None
+        #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
+        cuts = len(faces) if len(edges) else 0
+        self.counts = (len(edges), cuts, len(horizons), len(self.curves) if shapes else 0)
+        #: The first vertex of each edge, cut and horizon, on the host.
+        first = [edges.vertices[:, 0, 0], faces[:, 0] if len(edges) else []]
+        first.append(horizons.faces[:, 0] if len(horizons) else [])
+        self.first_vertices = np.concatenate([np.asarray(v, np.int64) for v in first])
+
+    @property
+    def any_smooth(self) -> bool:
+        """Are there edges with interpolated normals?"""
+        return self.edges is not None and self.edges.any_smooth
+
+    def placed(self, sensor: mi.Sensor) -> Placed:
+        return Placed(
+            Projection(sensor),
+            self.geometry.positions(),
+            self.curves.frames() if self.curves is not None else None,
+            self.geometry.normals() if self.horizons is not None else None,
+        )
+
+    def choose(self, lengths: mi.Float, sampler: mi.Sampler, count: int) -> Chosen:
+        """Choose edges in proportion to their length on the film."""
+        last = sum(self.counts) - 1
+        quantised = mi.UInt64(dr.ceil(mi.Float64(lengths) / LENGTH_UNIT))
+        cumulative = dr.cumsum(quantised)
+        total = mi.Float64(dr.gather(mi.UInt64, cumulative, last))
+        x = (mi.Float64(dr.arange(mi.UInt32, count)) + mi.Float64(sampler.next_1d())) * (total / count)
+        whole = mi.UInt64(x)
+        index = dr.binary_search(0, last, lambda i: dr.gather(mi.UInt64, cumulative, i) <= whole)
+        size = mi.Float64(dr.gather(mi.UInt64, quantised, index))
+        start = mi.Float64(dr.gather(mi.UInt64, cumulative, index)) - size
+        along = dr.select(size > 0, dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float)), 0)
+        density = dr.select(total > 0, mi.Float(count * size / total), 0)
+        # Edges come first, then cuts, horizons, pieces of curves.
+        is_edge, is_line = index < self.counts[0], index < sum(self.counts[:2])
+        is_curve = index >= sum(self.counts[:3])
+        is_horizon = ~is_line & ~is_curve
+        edge = dr.select(is_edge, index, 0)
+        face = dr.select(is_horizon, index - sum(self.counts[:2]), 0)
+        piece = dr.select(is_curve, index - sum(self.counts[:3]), 0)
+        return Chosen(index, along, density, is_edge, is_line, is_horizon, is_curve, edge, face, piece)
+
+    def find(self, at: Placed, chosen: Chosen) -> Found:
+        """What is known of the points before they are attached."""
+        projection, lens = at.projection, at.aperture_sample
+        found = Found(mi.Vector2f(0), mi.Bool(False))
+        if self.edges is not None:
+            a, b = self._end_points(at, chosen.index)
+            visible = projection.clip(a, b)
+            found.t, dt = visible.parameter(chosen.along)
+            found.along_film = projection.tangent(a, b, found.t, lens) * dt
+            found.valid = chosen.is_line & (visible.length > 0)
+        if self.curves is not None:
+            found.eye = -projection.view() if projection.orthographic else projection.eye(lens)
+            c = found.curve = self._curve_point(at, chosen, found)
+            on_film = projection.tangent(c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), lens)
+            found.along_film = dr.select(chosen.is_curve, on_film, found.along_film)
+            found.valid |= chosen.is_curve & c.valid & (projection.film(c.p).z > projection.near)
+        if self.horizons is not None:
+            h = self._horizon_point(at, chosen)
+            across = lambda v: projection.tangent(h.p, mi.Point3f(h.p + v), mi.Float(0), lens)
+            found.along_film = dr.select(chosen.is_horizon, across(h.tangent), found.along_film)
+            found.facing = across(h.facing)
+            found.valid |= chosen.is_horizon & h.valid & (projection.film(h.p).z > projection.near)
+        found.valid &= (chosen.density > 0) & dr.isfinite(dr.squared_norm(found.along_film))
+        return found
+
+    def point(self, at: Placed, chosen: Chosen, found: Found) -> mi.Point3f:
+        """The points, world space; attached."""
+        p = mi.Point3f(0)
+        if self.edges is not None:
+            p = dr.lerp(*self._end_points(at, chosen.index), found.t)
+        if self.curves is not None:
+            p = dr.select(chosen.is_curve, self._curve_point(at, chosen, found).p, p)
+        if self.horizons is not None:
+            p = dr.select(chosen.is_horizon, self._horizon_point(at, chosen).p, p)
+        return p
+
+    def _curve_point(self, at: Placed, chosen: Chosen, found: Found) -> CurvePoint:
+        return self.curves.point(at.frames, chosen.piece, chosen.along, found.eye, at.projection.orthographic)
+
+    def _horizon_point(self, at: Placed, chosen: Chosen) -> HorizonPoint:
+        eye, far = at.projection.viewer(at.aperture_sample), at.projection.orthographic
+        return self.horizons.point(at.positions, at.normals, chosen.face, chosen.along, eye, far)
+
+    # ---------------------- Lengths ----------------------
+
+    def _jumps(self, at: Placed, edge: mi.UInt32) -> mi.Bool:
+        """Does something jump at the edge, as seen from the sensor?"""
+        projection = at.projection
+        return self.edges.is_boundary(
+            at.positions,
+            edge,
+            projection.eye(),
+            view=projection.view() if projection.orthographic else None,
+            radius=projection.lens_radius(),
+            geometry=self.geometry,
+        )
+
+    def visible_lengths(self, at: Placed, lights: mi.Vector4f | None) -> mi.Float:
+        """Length inside the frame of each edge, cut, horizon and piece of a curve, 0 where nothing can jump: pixels on
+        the film; less where little jumps; of horizons and curves, an estimate."""
+        lengths, projection, positions = [], at.projection, at.positions
+        if self.edges is not None:
+            edge, face = (dr.arange(mi.UInt32, n) for n in self.counts[:2])
+            jumps = self._jumps(at, edge)
+            if lights is not None:
+                jumps |= self.edges.is_silhouette_of_any(positions, edge, lights)
+            for a, b in (self.edges.end_points(positions, edge), self._cut(at, face)):
+                lengths.append(projection.clip(a, b).length)
+            # The less faces turn, the less their planes hide: about as the square of the angle.
+            bend = self.edges.bend(positions, edge) * lengths[0] if self.soft and self.edges.any_smooth else 0
+            lengths[0] = dr.select(jumps, lengths[0], bend)
+        if self.horizons is not None:
+            face = dr.arange(mi.UInt32, self.counts[2])
+            eye, far, radius = projection.viewer(), projection.orthographic, projection.lens_radius()
+            a, b, possible = self.horizons.chords(positions, at.normals, face, eye, far, radius)
+            length = projection.clip(a, b).length
+            lengths.append(dr.select(possible, length, 0))
+        if self.curves is not None:
+            lengths.append(self._curve_length(at))
+        return dr.concat(lengths) if len(lengths) > 1 else lengths[0]
+
+    def _curve_length(self, at: Placed) -> mi.Float:
+        """About the length of each piece of a curve, 0 only where it is certainly out of the frame."""
+        projection, frames = at.projection, at.frames
+        piece = dr.arange(mi.UInt32, self.counts[3])
+        eye = -projection.view() if projection.orthographic else projection.eye()
+        lower, upper = projection.frame
+        points = [
+            projection.film(self.curves.point(frames, piece, mi.Float(t), eye, projection.orthographic).p)
+            for t in (0, 0.5, 1)
+        ]
+        start, middle, end = (q.position() for q in points)
+        length = dr.norm(middle - start) + dr.norm(end - middle)
+        size = dr.norm(mi.Vector2f(upper - lower))
+        # Another point of the lens may see all of it elsewhere.
+        blur = sum(projection.blur(q) / dr.abs(q.w) for q in points)
+        outside = mi.Bool(False)
+        for i in (0, 1):
+            outside |= (middle[i] + length + blur < lower[i]) | (middle[i] - length - blur > upper[i])
+        in_front = [q.z > projection.near for q in points]
+        whole = in_front[0] & in_front[1] & in_front[2] & dr.isfinite(length)
+        length = dr.select(outside, 0, dr.minimum(length, size) + LENGTH_UNIT)
+        length = dr.select(whole, length, dr.select(in_front[0] | in_front[1] | in_front[2], size, 0))
+        return length
+
+    def _end_points(self, at: Placed, index: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
+        """End points of edges, or beyond their number of cuts: world space."""
+        edges, faces = self.counts[:2]
+        is_edge, is_face = index < edges, (index >= edges) & (index < edges + faces)
+        edge = self.edges.end_points(at.positions, dr.select(is_edge, index, 0))
+        cut = self._cut(at, dr.select(is_face, index - edges, 0))
+        return tuple(dr.select(is_edge, e, c) for e, c in zip(edge, cut, strict=True))
+
+    def _cut(self, at: Placed, face: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
+        """End points of the cut of the near clipping plane through faces; NaN where there is none. World space."""
+        projection = at.projection
+        corners = [dr.gather(mi.Point3f, at.positions, dr.gather(mi.UInt32, corner, face)) for corner in self.corners]
+        depth = [projection.film(p).z - projection.near for p in corners]
+        # The corner that has the plane between itself and the two others, first.
+        front = [d > 0 for d in depth]
+        for k in (1, 2):
+            alone = (front[k] != front[0]) & (front[k] != front[3 - k])
+            corners[0], corners[k] = dr.select(alone, corners[k], corners[0]), dr.select(alone, corners[0], corners[k])
+            depth[0], depth[k] = dr.select(alone, depth[k], depth[0]), dr.select(alone, depth[0], depth[k])
+        crossed = (front[0] != front[1]) | (front[0] != front[2])
+        points = []
+        for k in (1, 2):
+            t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)
+            points.append(dr.select(crossed, dr.lerp(corners[0], corners[k], t), dr.nan))
+        return points[0], points[1]

@@ -1,0 +1,68 @@
+"""Optimisation steps as frozen functions (`dr.freeze`), beside the same steps unfrozen."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+STEPS = 4
+
+
+def numbers(value):
+    """A detached copy in Dr.Jit's own memory. The vertices of `cases.mesh` lie in NumPy's, see the documentation."""
+    if isinstance(value, mi.Transform4f):
+        return mi.Transform4f(value)
+    value = type(value)(dr.detach(value)) * dr.opaque(mi.Float, 1)
+    dr.eval(value)
+    return value
+
+
+def moved(initial, theta):
+    """The parameter at a distance or, for colours, a relative change theta."""
+    if isinstance(initial, mi.Transform4f):
+        return mi.Transform4f().translate([theta, 0.5 * theta, 0]) @ initial
+    return initial + theta
+
+
+def loss_of(image):
+    return dr.mean(dr.square(image - 0.2), axis=None)
+
+
+class Step:
+    """The step that is frozen: render, compare, differentiate. It counts how often Python executes it."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, scene, integrator, seed):
+        self.calls += 1
+        loss = loss_of(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=4, seed=seed))
+        dr.backward(loss)
+        return loss.array
+
+    def frozen(self):
+        def step(scene, integrator, seed):
+            return self(scene, integrator, seed)
+
+        return dr.freeze(step, state_fn=lambda scene, integrator, *_: integrator.find_boundaries(scene))
+
+
+def losses_and_gradients(step, scene, integrator, key, initial):
+    """Loss and its derivative, for other values and random numbers each time: (STEPS, 2)."""
+    params, result = mi.traverse(scene), []
+    for i in range(STEPS):
+        theta = dr.opaque(mi.Float, 0.02 * i)
+        dr.enable_grad(theta)
+        params[key] = moved(initial, theta)
+        params.update()
+        loss = step(scene, integrator, dr.opaque(mi.UInt32, 7 * i))
+        result.append((loss[0], dr.grad(theta)[0]))
+    return np.array(result)
+
+
+def assert_same(frozen, unfrozen):
+    """Equal but for the order of additions."""
+    scale = np.abs(unfrozen).max(axis=0)
+    assert (scale > 0).all() and (np.abs(np.diff(unfrozen, axis=0)).max(axis=0) > 1e-3 * scale).all()
+    np.testing.assert_allclose(frozen / scale, unfrozen / scale, rtol=0, atol=1e-5)
