@@ -18,7 +18,11 @@ from types import ModuleType
 import mitsuba as mi
 
 #: Their modules are plugin files, but for names with a leading underscore.
-PACKAGES = ("rimlight.bsdfs", "rimlight.emitters", "rimlight.integrators", "rimlight.sensors")
+PLUGINS = ("rimlight.bsdfs", "rimlight.emitters", "rimlight.integrators", "rimlight.sensors")
+
+#: Modules that are executed for each variant: plugin files, and what their base classes are made of. Dr.Jit remembers
+#: the types of the fields of a data class, which differ between variants.
+PACKAGES = (*PLUGINS, "rimlight.terms", "rimlight.transport")
 
 _modules: dict[str, dict[str, ModuleType]] = {}  # variant -> full name -> module
 
@@ -42,7 +46,7 @@ def register() -> None:
 
     _expose({})
     try:
-        for package_name in PACKAGES:
+        for package_name in PLUGINS:
             package = importlib.import_module(package_name)
             for module in pkgutil.iter_modules(package.__path__, package_name + "."):
                 if not module.name.rpartition(".")[2].startswith("_"):

@@ -17,8 +17,9 @@ import mitsuba as mi
 from rimlight.edge_sampling import Horizon, Lights
 from rimlight.edge_sampling.boundaries.horizon import turn_to_side
 from rimlight.edge_sampling.parametrisation import look_from, material_point, seen_by_camera
-from rimlight.transport import PathTracer, Scattering, Vertex
-from rimlight.transport.paths import step
+from rimlight.transport.paths import Vertex, step
+from rimlight.transport.scattering import Scattering
+from rimlight.transport.tracer import PathTracer
 
 from ._sinks import wide
 

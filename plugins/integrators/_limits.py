@@ -21,7 +21,7 @@ from rimlight.edge_sampling import (
     t_junctions,
 )
 from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, vertices
-from rimlight.transport import Depths
+from rimlight.transport.paths import Depths
 
 #: What perfect mirrors and glass do.
 MIRRORS = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission

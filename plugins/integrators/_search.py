@@ -22,7 +22,7 @@ from rimlight.edge_sampling import (
     find_welded_edges,
 )
 from rimlight.edge_sampling.boundaries.found import Boundaries
-from rimlight.transport import Depths
+from rimlight.transport.paths import Depths
 
 from ._limits import Media, Moving, PartialParameters, beyond_far_plane, lasting_limits
 

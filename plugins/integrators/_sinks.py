@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.transport import CutRays
+from rimlight.transport.cut_rays import CutRays
 
 from ._layers import Layers
 

@@ -10,8 +10,11 @@ from rimlight._collection import no_collection
 from rimlight._plan import Plan, names
 from rimlight.edge_sampling import Batch
 from rimlight.edge_sampling.boundaries.found import Boundaries
-from rimlight.terms import TERMS, Counts, FilmSamples, Job, Sample
-from rimlight.transport import Depths, PathTracer
+from rimlight.terms.order import TERMS
+from rimlight.terms.sampling import Counts
+from rimlight.terms.term import FilmSamples, Job, Sample
+from rimlight.transport.paths import Depths
+from rimlight.transport.tracer import PathTracer
 
 from ._finite import report_gradients, report_image, values_of
 from ._options import check_options, is_whole

@@ -7,8 +7,8 @@ import mitsuba as mi
 
 from rimlight._collection import no_collection
 from rimlight.edge_sampling import FilmPart, Lights, stratified
-from rimlight.terms import Job
 from rimlight.terms.sampling import in_a_row, over_film, seed_of
+from rimlight.terms.term import Job
 
 from ._finite import report_gradients, report_image
 from ._layers import Layers, LayerSamples

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
-from rimlight.transport import CutRays
+from rimlight.transport.cut_rays import CutRays
 
 from .sampling import over_film
 from .term import FilmSamples, Job, Sample, Term

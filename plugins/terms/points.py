@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import stratified
-from rimlight.transport import CutRays
+from rimlight.transport.cut_rays import CutRays
 
 from .sampling import over_film, seed_of
 from .shadows import nothing_at_points

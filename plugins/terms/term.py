@@ -14,7 +14,9 @@ import mitsuba as mi
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart, film_parts
 from rimlight.edge_sampling.boundaries.found import Boundaries
-from rimlight.transport import CutRays, PathTracer, Replay
+from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.paths import Replay
+from rimlight.transport.tracer import PathTracer
 
 from .sampling import Counts, per_pixel, size
 

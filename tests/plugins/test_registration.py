@@ -213,3 +213,41 @@ def test_packages_are_imported_by_their_name(root: Path, folder: str) -> None:
     for file in [*files(root / folder), *files(root / "tests")]:
         tops = {name.split(".")[0] for name in imports(file)}
         assert not tops & {"plugins", "edge_sampling", "inverse"}, file
+
+
+#: What each room may import: itself, and those before it.
+ROOMS = (
+    "rimlight.edge_sampling.geometry",
+    "rimlight.edge_sampling.projection",
+    "rimlight.edge_sampling.lights",
+    "rimlight.edge_sampling.smooth_lamps",
+    "rimlight.edge_sampling.parametrisation",
+    "rimlight.edge_sampling.choice",
+    "rimlight.edge_sampling.boundaries",
+    "rimlight.transport",
+    "rimlight.terms",
+    "rimlight.integrators",
+)
+
+
+def room(name: str) -> int | None:
+    """Number of the room that a module is in, None if it is in none."""
+    return next((i for i, r in enumerate(ROOMS) if f"{name}.".startswith(f"{r}.")), None)
+
+
+@pytest.mark.parametrize("folder", ["edge_sampling", "plugins"])
+def test_imports_run_one_way(root: Path, folder: str) -> None:
+    package = "rimlight.edge_sampling" if folder == "edge_sampling" else "rimlight"
+    seen = 0
+    for file in files(root / folder):
+        module = ".".join([package, *file.relative_to(root / folder).with_suffix("").parts])
+        own = room(module)
+        if own is None:
+            continue
+        seen += 1
+        later = {n for n in imports(file) if room(n) is not None and room(n) > own}
+        assert not later, f"{file} imports {later}"
+        # All of `edge_sampling` together is for those above.
+        whole = {n for n in imports(file) if n.startswith("rimlight.edge_sampling.") and room(n) is None}
+        assert folder != "edge_sampling" or not whole, f"{file} imports {whole}"
+    assert seen > 10

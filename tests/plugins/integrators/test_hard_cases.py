@@ -17,7 +17,7 @@ from random_scenes import torus
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import Geometry, ShadingBoundary, Silhouettes, find_edges
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
-from rimlight.transport import PathTracer
+from rimlight.transport.tracer import PathTracer
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
 SIDE = [1, 0.3, 0.2]
