@@ -1,7 +1,8 @@
 """Deliberate faults, one at a time, and which tests notice each:  python tests/mutants.py [--only NUMBER ...] [TEST]
 
 A test that cannot fail proves nothing. Each fault is made in a copy of the project, never in the project itself. The
-tests stop at the third that fails; what no test notices is listed at the end, with exit code 1.
+fast tests run first, and the others only if none of these fails. They stop at the third that fails; what no test
+notices is listed at the end, with exit code 1.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"plugins": "", "edge_sampling": "edge_sampling", "inverse": "inverse", "scenes": "scenes"}
 
 TESTS = ("derivatives", "coarse_meshes", "fine_meshes", "stale", "direct_edge", "prb_edge", "random_scenes")
+FOLDER = "tests/plugins/integrators"
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,11 @@ def mutant(fault: str, file: str, *texts: str) -> Mutant:
     return Mutant(fault, file, tuple(zip(texts[::2], texts[1::2], strict=True)))
 
 
-INTEGRATOR = "plugins/integrators/edge_integrator.py"
+SEARCH = "plugins/integrators/_search.py"
+FOUND = "edge_sampling/boundaries/found.py"
+OUTLINES = "edge_sampling/boundaries/film_outlines.py"
 SCATTERING = "plugins/transport/scattering.py"
+PARAMETRISATION = "edge_sampling/parametrisation.py"
 FILM = "edge_sampling/boundaries/film_boundary.py"
 SHADOWS = "edge_sampling/boundaries/shadow_boundary.py"
 SHADING = "edge_sampling/boundaries/shading_boundary.py"
@@ -47,9 +52,9 @@ MUTANTS = [
     # ---------------------- A term, 2 % too large ----------------------
     mutant(
         "interior: 2 % too large",
-        INTEGRATOR,
-        "value = Sample(mi.Spectrum(L * ray_weight), mi.Float(0))",
-        "value = Sample(mi.Spectrum(1.02 * L * ray_weight), mi.Float(0))",
+        "plugins/terms/interior.py",
+        "value = Sample(mi.Spectrum(found.L * ray_weight), mi.Float(0))",
+        "value = Sample(mi.Spectrum(1.02 * found.L * ray_weight), mi.Float(0))",
     ),
     mutant(
         "film boundary: 2 % too large",
@@ -82,12 +87,12 @@ MUTANTS = [
     mutant(
         "shadows from lights: motion of the light not followed",
         SHADOWS,
-        "q = dr.select(on_surface, on_light.p, q)",
-        "q = dr.select(on_surface, dr.detach(on_light.p), q)",
+        "return q\n",
+        "return dr.detach(q)\n",
     ),
     mutant(
         "interior: change of area left out",
-        SCATTERING,
+        PARAMETRISATION,
         "if self.moving:\n            geometry",
         "if False:\n            geometry",
     ),
@@ -99,7 +104,7 @@ MUTANTS = [
     ),
     mutant(
         "interior: background stands still when the camera turns",
-        SCATTERING,
+        PARAMETRISATION,
         "return active & si.is_valid() & ~si.shape.is_mesh() & (dr.abs_dot",
         "return active & ~si.shape.is_mesh() & (dr.abs_dot",
     ),
@@ -130,30 +135,30 @@ MUTANTS = [
         "if throws_shadows(emitters[i])])",
         "if throws_shadows(emitters[i])][:1])",
     ),
-    mutant("tree of edges: not refitted", INTEGRATOR, "boundaries.silhouettes.refit()", "pass"),
-    mutant("edges: never found again", INTEGRATOR, "        if same:\n", "        if self._sources is not None:\n"),
+    mutant("tree of edges: not refitted", FOUND, "self.silhouettes.refit()", "pass"),
+    mutant("edges: never found again", SEARCH, "        if same:\n", "        if self._sources is not None:\n"),
     mutant(
         "film boundary: folds hidden by their own mesh count",
         FILM,
-        "active &= ~(is_edge & self.edges.is_hidden_fold(positions, edge, p, rays, *hides))",
+        "active &= ~(chosen.is_edge & self.outlines.edges.is_hidden_fold(at.positions, chosen.edge, p, rays, *hides))",
         "pass",
     ),
     mutant(
         "film boundary: no horizons of interpolated normals",
-        FILM,
+        OUTLINES,
         "self.horizons = horizons if len(horizons) else None",
         "self.horizons = None",
     ),
     # ---------------------- Details ----------------------
     mutant(
         "film: samples of the boundary weigh in the filter",
-        INTEGRATOR,
-        "return Term(part.to_film(s.position), value, s.wavelengths, 0.0, 0)\n\n    def _shadows",
-        "return Term(part.to_film(s.position), value, s.wavelengths, 1.0, 0)\n\n    def _shadows",
+        "plugins/terms/film.py",
+        "value, s.wavelengths, 0.0, 0)",
+        "value, s.wavelengths, 1.0, 0)",
     ),
     mutant(
         "film boundary: cuts of the near plane stand still",
-        FILM,
+        OUTLINES,
         "t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)",
         "t = dr.detach(depth[0] / dr.select(crossed, depth[0] - depth[k], 1))",
     ),
@@ -166,7 +171,7 @@ MUTANTS = [
     ),
     mutant(
         "interior: a lamp lights itself in its own plane",
-        SCATTERING,
+        PARAMETRISATION,
         "return height <= FLUSH * dr.epsilon(mi.Float) * scale",
         "return height < 0",
     ),
@@ -181,35 +186,49 @@ def copy_of_project(folder: Path) -> None:
     shutil.copy(ROOT / "pyproject.toml", folder)
 
 
-def apply(m: Mutant, folder: Path) -> None:
+def path(m: Mutant, folder: Path) -> Path:
     package, _, rest = m.file.partition("/")
-    file = folder / "rimlight" / PACKAGES[package] / rest
-    text = file.read_text()
+    return folder / "rimlight" / PACKAGES[package] / rest
+
+
+def changed(m: Mutant, text: str) -> str:
+    """The text of its file with the fault.
+
+    Raises
+    ------
+    ValueError : what is to be changed is not there, or more than once.
+    """
     for old, new in m.changes:
         if text.count(old) != 1:
-            raise SystemExit(f"{m.fault}: {m.file} has {text.count(old)} times: {old}")
+            raise ValueError(f"{m.fault}: {m.file} has {text.count(old)} times: {old}")
         text = text.replace(old, new)
-    file.write_text(text)
+    return text
 
 
 def failures(m: Mutant, tests: list[str]) -> list[str]:
-    """Names of the first tests that fail with it."""
+    """Names of the first tests that fail with it: of the fast ones, or if none of these does, of all."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         copy_of_project(folder)
-        apply(m, folder)
-        command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--maxfail", "3", "-p", "no:cacheprovider", *tests]
+        file = path(m, folder)
+        file.write_text(changed(m, file.read_text()))
         # Found before the project that is installed.
         environment = {**os.environ, "PYTHONPATH": str(folder)}
-        run = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-        if run.returncode not in (0, 1, 2):
-            raise SystemExit(f"{m.fault}: the tests did not run\n{run.stdout[-2000:]}{run.stderr[-2000:]}")
-        return re.findall(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.M)
+        for which in (["-m", "fast"], []):
+            options = ["-q", "-n", "2", "--maxfail", "3", "-p", "no:cacheprovider", *which]
+            command = [sys.executable, "-m", "pytest", *options, *tests]
+            run = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+            if run.returncode not in (0, 1, 2):
+                raise SystemExit(f"{m.fault}: the tests did not run\n{run.stdout[-2000:]}{run.stderr[-2000:]}")
+            found = re.findall(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.M)
+            if found:
+                return found
+    return []
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tests", nargs="*", default=[f"tests/test_{name}.py" for name in TESTS], metavar="TEST")
+    parser.add_argument("tests", nargs="*", default=[f"{FOLDER}/test_{name}.py" for name in TESTS], metavar="TEST")
     parser.add_argument("--only", type=int, nargs="*", metavar="NUMBER", help="these faults, counted from 0")
     parser.add_argument("--list", action="store_true", help="the faults")
     options = parser.parse_args()
