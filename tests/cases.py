@@ -897,7 +897,7 @@ CASES = [
     ),
     # Geometry that moves at indirect bounces: only there, and in the frame as well.
     Case("out_of_frame", out_of_frame, SIDE, 0.12, spp=1024, runs=100, integrator=prb_edge(3)),
-    Case("open_air", open_air, SIDE, 1e-2, runs=96, integrator=prb_edge(3)),
+    Case("open_air", open_air, SIDE, 1e-2, spp=128, runs=96, integrator=prb_edge(3)),
 ]
 
 
