@@ -528,6 +528,17 @@ def open_air() -> mi.Scene:
     )
 
 
+def sky_blocker() -> mi.Scene:
+    """A square above the frame, over a floor under the sky alone: all of the derivative comes from edges that points of
+    the floor see."""
+    return scene(
+        sensor=camera((0, 2, -5), (0, 0, 0)),
+        floor=horizontal((0, 0, 0), 4, "floor", bsdf=diffuse(0.6, 0.5, 0.4)),
+        blocker=horizontal((0.3, 2.2, -0.2), 1.5, "blocker", down=True, bsdf=diffuse(0)),
+        environment=constant(),
+    )
+
+
 def hard_shadow(lamp: Callable[[], dict], sensor: Callable[[], dict] = camera) -> Callable[[], mi.Scene]:
     """A cube and its shadow on a floor, in the light of a lamp without size."""
     return lambda: scene(
@@ -898,6 +909,7 @@ CASES = [
     # Geometry that moves at indirect bounces: only there, and in the frame as well.
     Case("out_of_frame", out_of_frame, SIDE, 0.12, spp=1024, runs=100, integrator=prb_edge(3)),
     Case("open_air", open_air, SIDE, 1e-2, spp=128, runs=96, integrator=prb_edge(3)),
+    Case("sky_blocker", sky_blocker, BLOCKER_SIDE, 5e-2, spp=256, runs=48),
 ]
 
 

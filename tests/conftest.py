@@ -24,7 +24,7 @@ FAST_CASES = (
     "two_triangles_green cube_depth cube_welded coloured_cube_camera textured_cube_side orthographic_camera "
     "thin_lens_camera fisheye_camera gaussian_filter near_plane_cut smooth_torus room_cube shadow_blocker "
     "shadow_camera shadow_light glossy_receiver open_air spot_light sun_cube led_cube distant_lights sphere_soft "
-    "cylinder_soft surroundings_turn glowing_torus coarse_lamp_cube reflecting_cube"
+    "cylinder_soft sky_blocker surroundings_turn glowing_torus coarse_lamp_cube reflecting_cube"
 )
 
 

@@ -93,7 +93,8 @@ class FilmBoundary:
         self.outlines = FilmOutlines(geometry, edges, moving, soft=soft)
         self.transmit = self._transmitting(geometry)
 
-    def __len__(self) -> int:
+    @property
+    def edge_count(self) -> int:
         """Number of edges, and of pieces of curves."""
         return self.outlines.counts[0] + self.outlines.counts[3]
 

@@ -113,7 +113,8 @@ class ShadowBoundary:
             u = dr.select(active, view.u, 0)  # what is not finite would spoil pixels, even with the value 0
             if projection.attached:
                 # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
-                dr.eval(jump, n_dl, active, view, met, light, edge, shadow, u)
+                kept = (light.light, light.numbers, light.y, light.far, edge.sample, shadow.facing, shadow.lift)
+                dr.eval(jump, n_dl, active, view.seen, view.ray, met, shadow.onwards, kept, u)
 
         with dr.resume_grad():
             p = silhouettes.point(placement, edge.sample, light.y, light.far).p

@@ -47,6 +47,15 @@ class EdgeIntegrator(ADIntegrator):
     #: Does it have boundaries as shading points see them?
     FROM_POINTS = True
 
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        if "sample" in vars(cls):
+            # Images would follow it, derivatives would not.
+            raise TypeError(
+                f"{cls.__name__}: derivatives do not call `sample`. Override `radiance` of a `PathTracer`, and name "
+                "that tracer in `TRACER`, as the documentation shows under Extending."
+            )
+
     def __init__(self, props: mi.Properties, max_depth: int = 2, rr_depth: int = 5):
         check_options(props, self.OPTIONS, self.IDLE)
         super().__init__(props)

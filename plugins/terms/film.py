@@ -24,7 +24,7 @@ class FilmTerm(Term):
         film, sppp = job.boundaries.film, job.counts.film
         moves = "only lights move" if job.boundaries.anything_moves else "nothing moves"
         count = sum(job.counts.on_line(part.sensor.film()) for part in job.parts) if film is not None else 0
-        edges = len(film) if film is not None else 0
+        edges = film.edge_count if film is not None else 0
         why_not = '"sppp" is 0' if film is not None and not sppp else moves
         return self.plan(count, 2 * job.rays_of_path, f"{edges} edges may move on the film", why_not)
 

@@ -77,3 +77,10 @@ def test_options_of_the_projective_integrators_have_no_effect(kind):
 def test_unknown_properties_of_other_plugins_are_refused(plugin):
     with pytest.raises(RuntimeError, match="no_such_property"):
         mi.load_dict({**plugin, "no_such_property": 1})
+
+
+def test_integrators_that_override_sample_are_refused():
+    """Their images would follow it, and their derivatives would not."""
+    base = next(c for c in type(mi.load_dict({"type": "direct_edge"})).__mro__ if hasattr(c, "TRACER"))
+    with pytest.raises(TypeError, match="derivatives do not call `sample`"):
+        type("Mine", (base,), {"sample": lambda self, *_, **__: None})
