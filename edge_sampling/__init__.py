@@ -3,6 +3,7 @@
 from .boundaries.face_planes import FacePlanes
 from .boundaries.film_boundary import BoundarySamples, FilmBoundary
 from .boundaries.horizon import Horizon, Horizons
+from .boundaries.indirect_shadows import IndirectShadows
 from .boundaries.shading_boundary import ShadingBoundary
 from .boundaries.shadow_boundary import ShadowBoundary, ShadowSamples
 from .choice.edge_tree import EdgeTree
@@ -32,6 +33,7 @@ __all__ = [
     "Geometry",
     "Horizon",
     "Horizons",
+    "IndirectShadows",
     "Lights",
     "Lobe",
     "Projection",

@@ -5,7 +5,8 @@ it: what the interior term holds fixed is what the sides of a boundary move with
 
 ====================================  ======================================================================
 what the camera sees                  the film position: the *ray* is fixed on the film, and moves with the camera
-every further vertex of a path        the *material point*, which follows its surface
+every further vertex of a path        far from the vertex before: the *material point*, which follows its surface;
+                                      close to it: the direction, so that the vertex slides over its surface
 a point on a lamp                     the material point
 one side of a boundary                as the interior term has the point that is seen there
 a point of a light without size       the light's own numbers: it goes where the light goes
@@ -16,6 +17,10 @@ what a perfect mirror shows           the random numbers: the ray turns with the
 With the solid angle written as area, dω = |cos θ_y| dA(y) / r², a material point y makes the integrand a product, of
 which every factor follows the motion of x and y (Zhang et al. 2020, "Path-space differentiable rendering"). So what
 moves together sees no motion at all.
+
+Where two surfaces meet and only one of x and y moves, the change of 1 / r² has no finite variance. So scattered light
+is divided: the part `far(r)` of what arrives from a point at the distance r is held at the material point, the rest in
+its direction. Both parts add up to the whole, so that the division may be chosen at will (`Vicinity`).
 """
 
 from __future__ import annotations
@@ -31,6 +36,9 @@ from .smooth_lamps import SmoothLamps
 #: solid angle that an element of it covers, change as 1 / cos; single precision does not know cosines of 1e-4, and
 #: single samples would outweigh all others. The loss is of this order, relative to what the surface itself contributes.
 GRAZING = 1e-3
+
+#: Radius of the vicinity of a vertex, relative to the distance of the camera from the first vertex of its path.
+VICINITY = 0.2
 
 #: Height over a tangent plane that is taken for rounding, in units in the last place of the coordinates.
 FLUSH = 16
@@ -59,6 +67,28 @@ def material_point(
 ) -> mi.SurfaceInteraction3f:
     """What a ray meets; it follows its surface, attached unless gradients are suspended."""
     return pi.compute_surface_interaction(ray, flags | mi.RayFlags.FollowShape, active)
+
+
+def sliding_point(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, held: mi.Float, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """What a ray meets, attached to the surface and to the ray: the part `held` of its motion is that of the material
+    point, the rest that of the point where the ray meets the surface."""
+    si = material_point(dr.detach(ray), pi, active, mi.RayFlags.All)
+    slides = active & (dr.detach(held) < 1)
+    slides &= ~grazes(si, ray.d, slides)
+    slid = pi.compute_surface_interaction(ray, mi.RayFlags.All, slides)
+
+    def blend(a, b):
+        if not dr.grad_enabled(a, b):
+            return a
+        return dr.select(slides, dr.replace_grad(a, dr.lerp(b, a, held)), a)
+
+    for field in ("p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv"):
+        setattr(si, field, blend(getattr(si, field), getattr(slid, field)))
+    frame = si.sh_frame
+    si.sh_frame = mi.Frame3f(*(blend(getattr(frame, k), getattr(slid.sh_frame, k)) for k in "stn"))
+    return si
 
 
 def shown_by_mirror(
@@ -92,6 +122,30 @@ def flush(x: mi.SurfaceInteraction3f, y: mi.SurfaceInteraction3f) -> mi.Bool:
         scale = dr.max(dr.maximum(dr.abs(x.p), dr.abs(y.p)))
         height = dr.minimum(dr.abs_dot(x.n, d), dr.abs_dot(y.n, d))
         return height <= FLUSH * dr.epsilon(mi.Float) * scale
+
+
+# ---------------------- Vicinity ----------------------
+
+
+@dataclass(frozen=True)
+class Vicinity:
+    """The ball around each vertex of a path in which the next one slides.
+
+    radius : mi.Float, (N,), scene units, the same for all vertices of a path; detached. 0: nothing slides.
+    """
+
+    radius: mi.Float
+
+    @staticmethod
+    def of(first: mi.PreliminaryIntersection3f) -> Vicinity:
+        """That of the paths which meet their first vertex there."""
+        return Vicinity(dr.select(first.is_valid(), VICINITY * first.t, 0))
+
+    def far(self, r2: mi.Float) -> mi.Float:
+        """Part of the light from the squared distance `r2` that is held at the material point: 1 from the radius on,
+        and in proportion to r2 near 0. It may be attached."""
+        s = dr.select(self.radius > 0, dr.minimum(r2 / dr.square(dr.maximum(self.radius, 1e-18)), 1), 1)
+        return 1 - (1 - s) * dr.square(1 - s)
 
 
 # ---------------------- What joins two of them ----------------------

@@ -411,8 +411,6 @@ class Generator:
         name = f"light{i}"
         kinds = ("area", "ball", "disklight", "meshball", "point", "spot", "sun", "sky", "environment")
         kind = self.pick(*kinds)
-        if self.depth > 2 and kind in ("point", "spot", "sun"):
-            kind = "area"  # hard shadows in indirect light are missing
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
         centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])

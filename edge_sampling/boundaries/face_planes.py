@@ -22,7 +22,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth
 from rimlight.edge_sampling.parametrisation import material_point
 
-from .tracer import ShadingPoint, Tracer, emitted_and_scattered
+from .tracer import ShadingPoint, Tracer
 
 #: Sine of the angle between the plane and the directions just beside it.
 BESIDE_PLANE = 1e-5
@@ -58,13 +58,22 @@ class FacePlanes:
                 reflects = active & dr.any(F != 0)
                 pi = scene.ray_intersect_preliminary(ray, active=reflects)
                 y = pi.compute_surface_interaction(ray, mi.RayFlags.All, reflects)
-                L = emitted_and_scattered(tracer, ray, pi, y, point.depth, sampler.clone(), reflects)
-                sides.append((ray, pi, reflects & y.is_valid(), dr.select(reflects, side * F * L, 0)))
+                emitted, scattered = y.emitter(scene, reflects).eval(y, reflects), mi.Spectrum(0)
+                if tracer.scatters(2):
+                    onwards = reflects & y.is_valid() & tracer.scatters(point.depth + 1)
+                    scattered = tracer.scattered(ray, pi, point.depth, sampler.clone(), onwards)
+                    scattered = dr.select(onwards, scattered, 0)
+                jumps = [dr.select(reflects, side * F * L, 0) for L in (emitted, scattered)]
+                sides.append((ray, pi, reflects & y.is_valid(), jumps))
         value = mi.Spectrum(0)
         with dr.resume_grad():
-            for ray, pi, valid, jump in sides:
-                y = material_point(ray, pi, valid).p
+            for ray, pi, valid, jumps in sides:
+                d = material_point(ray, pi, valid).p - si.p
                 # What is infinitely far away is seen in a fixed direction.
-                g = dr.dot(si.n, dr.normalize(dr.select(valid, y - si.p, mi.Vector3f(ω))))
-                value += jump * dr.select(active, g - dr.detach(g), 0)
+                towards = dr.normalize(dr.select(valid, d, mi.Vector3f(ω)))
+                far = point.vicinity.far(dr.detach(dr.squared_norm(d)))
+                # What emits is a material point everywhere, what scatters only far away.
+                for jump, held in zip(jumps, (1, dr.select(valid, far, 1)), strict=True):
+                    g = dr.dot(si.n, dr.lerp(dr.detach(towards), towards, held))
+                    value += jump * dr.select(active, g - dr.detach(g), 0)
         return value

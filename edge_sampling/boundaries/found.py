@@ -8,6 +8,7 @@ from rimlight.edge_sampling.choice.silhouettes import Silhouettes
 
 from .face_planes import FacePlanes
 from .film_boundary import FilmBoundary
+from .indirect_shadows import IndirectShadows
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary
 
@@ -20,6 +21,7 @@ class Boundaries:
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
     shading: ShadingBoundary | None = None
+    indirect: IndirectShadows | None = None
     planes: FacePlanes | None = None
     moving: tuple[bool, ...] = ()
     camera_moves: bool = False

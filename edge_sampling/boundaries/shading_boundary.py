@@ -26,9 +26,10 @@ from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic, 
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Lobe, View
 from rimlight.edge_sampling.geometry.device_edges import beside_edge
-from rimlight.edge_sampling.parametrisation import material_point
+from rimlight.edge_sampling.parametrisation import Vicinity, material_point
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
+from .indirect_shadows import is_bent, share
 from .tracer import ShadingPoint, Tracer
 
 #: Directions that are sampled from a BSDF, to find its peak.
@@ -53,7 +54,7 @@ class ShadingBoundary:
     """
 
     _NUMBERS = ("transmits", "glossy", "emission", "emission_at_first", "several")
-    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps")
+    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None):
@@ -62,6 +63,8 @@ class ShadingBoundary:
         self.moving_shapes = None if moving is None else [mi.ShapePtr(s) for s in moving]
         self.boxes = EmitterBoxes(scene, geometry)
         self.smooth_lamps = SmoothLamps(scene)
+        lamps = [e.get_shape() for e in scene.emitters() if e.flags() & mi.EmitterFlags.Surface]
+        self.bent_lamps = [mi.ShapePtr(s) for s in lamps if is_bent(s)]
         emitters = scene.emitters()
         #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
         lights = [i for i, e in enumerate(emitters) if not e.flags() & mi.EmitterFlags.Delta]
@@ -70,7 +73,7 @@ class ShadingBoundary:
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
         self.glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
-        #: Emitters of several lights (see `Lights`): at the first vertex, only their background counts.
+        #: Emitters of several lights (see `Lights`): only their background counts.
         self.several = [e for e in emitters if hasattr(e, "light_count")]
         #: Is emitted light sought at points that the camera sees, too? For diffuse surfaces `ShadowBoundary` is enough,
         #: except for the light of environments.
@@ -132,7 +135,12 @@ class ShadingBoundary:
                 [self._lobe(si, bsdf, sampler, active)] if self.glossy else [],
                 cone,
             )
-            use = [1, dr.select(moves, 1, 0)][: self.silhouettes.groups]
+            # Of what scatters light, both sides of each edge count close by.
+            vicinity = Vicinity(dr.select(emission, 0, point.vicinity.radius))
+            if tracer.scatters(2):
+                view.vicinity = vicinity
+            # What is seen past an edge that stands still may move. What emits does not: else all would be in one group.
+            use = [1, dr.select(moves | point.slides | ~emission, 1, 0)][: self.silhouettes.groups]
 
             def draw(k, sampler):
                 part = (choice + k) / CANDIDATES
@@ -143,12 +151,15 @@ class ShadingBoundary:
             def unshadowed(e):
                 outline = self.silhouettes.point(placement, e, si.p)
                 d = outline.p - si.p
+                r2 = dr.squared_norm(d)
                 f = bsdf.eval(mi.BSDFContext(), si, si.to_local(dr.normalize(d)), active)
-                return dr.max(f) * dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(dr.squared_norm(d))
+                arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
+                seen_past = outline.outward(dr.cross(d, outline.tangent)) != 0
+                return dr.max(f) * arc * dr.select(seen_past, 1, 1 - vicinity.far(r2))
 
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
             e.density *= dr.select(emission, p / lights, 1 - p)
-        return self._evaluate(tracer, placement, point, e, sampler, active, light, emission)
+        return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, vicinity)
 
     @staticmethod
     def _lobe(si, bsdf, sampler, active) -> Lobe:
@@ -189,15 +200,15 @@ class ShadingBoundary:
         active: mi.Bool,
         light: mi.EmitterPtr,
         emission: mi.Bool,
+        vicinity: Vicinity,
     ) -> mi.Spectrum:
         """What a point on an edge does to the light that is reflected.
 
         light : the only one whose emission counts.
         emission : does emitted light count, or scattered light?
+        vicinity : within which the directions are held, in which scattered light arrives.
         """
         scene, si = tracer.scene, point.si
-        # What the sensor sees has the shadows that are found from the lights, too.
-        share_emission = point.depth == 1
         with dr.suspend_grad():
             # Mitsuba's rays start above the surface: look from there.
             towards = self.silhouettes.point(placement, sample, si.p).p - si.p
@@ -211,42 +222,74 @@ class ShadingBoundary:
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
             active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
-            side = outline.outward(across)
-            active &= side != 0
+            outward = outline.outward(across)
+            # Of a crease, both sides are faces of its own.
+            near = 1 - vicinity.far(dr.square(distance))
+            active &= (outward != 0) | (near > 0)
             n_dl = dr.select(active, n_dl, 0)
             aside = beside_edge(p, x)
-            ray = si.spawn_ray(dr.normalize(mi.Point3f(p + side * aside * across) - x))
-            pi = scene.ray_intersect_preliminary(ray, active=active)
-            y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            # What is met before the edge hides it, unless it is a surface on which the edge lies: beside the edge, that
-            # may be met a little earlier.
-            active &= ~(pi.is_valid() & (pi.t < distance) & (dr.abs_dot(y.n, p - y.p) > aside))
-            emitter = y.emitter(scene, active)
-            lit = active & emission & (emitter == light)
-            L = emitter.eval(y, lit)
-            for several in self.several:
-                mine = lit & share_emission & (emitter == mi.EmitterPtr(several))
-                L = dr.select(mine, several.eval_background(y, mine), L)
-            shared = lit & share_emission & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-            on_smooth = lit & ~shared & self.smooth_lamps.are(y.shape) if len(self.smooth_lamps) else mi.Bool(False)
-            light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared | on_smooth)
-            mis = power_heuristic(pdf, light_pdf)
-            L *= dr.select(shared, mis, 1)
-            if len(self.smooth_lamps):
-                L *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
+
+            def look(side, active):
+                """What is seen beside the edge, unless something before the edge hides it."""
+                ray = si.spawn_ray(dr.normalize(mi.Point3f(p + side * aside * across) - x))
+                pi = scene.ray_intersect_preliminary(ray, active=active)
+                y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+                # Not a surface on which the edge lies: beside the edge, that may be met a little earlier.
+                off = dr.abs_dot(y.n, p - y.p) > aside
+                return ray, pi, y, pi.is_valid() & (pi.t < distance) & off, pi.is_valid() & ~off
+
+            side = dr.select(outward != 0, outward, 1)
+            ray, pi, y, hidden, own = look(side, active)
+            past = outward != 0
+            active &= ~hidden & (past | own)
+            L = mi.Spectrum(0)
+            if self.emission:
+                L += self._emitted(tracer, point, ray, y, ω, pdf, active & past & emission, light)
             valid = active & y.is_valid()
             if tracer.scatters(2):
+                again = sampler.clone()
                 reflected = valid & ~emission
                 L += dr.select(reflected, tracer.scattered(ray, pi, point.depth, sampler, reflected), 0)
-            L = dr.select(active, f * L, 0)
+                other_ray, other_pi, _, hidden, own = look(-side, active & ~emission & (near > 0))
+                reflected = active & ~emission & (near > 0) & ~hidden & own
+                other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected)
+                # What its own faces show, held in its direction in the vicinity.
+                faces = dr.select(reflected, other_L, 0) - dr.select(active & ~past, L, 0)
+                faces = side * near * dr.select(active, f * faces, 0)
+            L = dr.select(active & past, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
             p = self.silhouettes.point(placement, sample, dr.detach(x)).p
-            y = material_point(ray, pi, valid).p
             x = si.p + lift
-            velocity = _turning(n_dl, p - x, active) - _turning(n_dl, y - x, valid)
-            return -side * L * velocity
+            edge = _turning(n_dl, p - x, active)
+            d = material_point(ray, pi, valid).p - x
+            beyond = vicinity.far(dr.detach(dr.squared_norm(d))) * _turning(n_dl, d, valid)
+            value = -side * L * (edge - beyond)
+            return value + faces * edge if tracer.scatters(2) else value
+
+    def _emitted(self, tracer, point, ray, y, ω, pdf, active, light: mi.EmitterPtr) -> mi.Spectrum:
+        """Light that one light emits at y towards a point. pdf : density of ω among samples of the BSDF there."""
+        scene, si = tracer.scene, point.si
+        at_first = point.depth == 1
+        emitter = y.emitter(scene, active)
+        lit = active & (emitter == light)
+        L = emitter.eval(y, lit)
+        for several in self.several:
+            mine = lit & (emitter == mi.EmitterPtr(several))
+            L = dr.select(mine, several.eval_background(y, mine), L)
+        # Shadows that are found from the lights, too; all of those on what the sensor sees.
+        shared = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+        for lamp in self.bent_lamps:
+            shared &= at_first | (y.shape != lamp)
+        on_smooth = lit & ~shared & self.smooth_lamps.are(y.shape) if len(self.smooth_lamps) else mi.Bool(False)
+        light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared | on_smooth)
+        mis = power_heuristic(pdf, light_pdf)
+        theirs = (1 - mis) * dr.select(at_first, 1, share(point, point.density))
+        L *= dr.select(shared, 1 - theirs, 1)
+        if len(self.smooth_lamps):
+            L *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
+        return L
 
 
 def _turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:

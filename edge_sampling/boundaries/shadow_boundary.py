@@ -75,9 +75,13 @@ class ShadowBoundary:
         self.lights, self.smooth_lamps = Lights(scene), SmoothLamps(scene)
         emitters = scene.emitters()
         #: Numbers of the lights whose shadows are sampled.
-        self.chosen = mi.UInt32([k for k, i in enumerate(self.lights.emitter) if throws_shadows(emitters[i])])
-        on_surface = {bool(e.flags() & mi.EmitterFlags.Surface) for e in emitters if throws_shadows(e)}
+        self.chosen = mi.UInt32([k for k, i in enumerate(self.lights.emitter) if self.counts(emitters[i])])
+        on_surface = {bool(e.flags() & mi.EmitterFlags.Surface) for e in emitters if self.counts(e)}
         self.any_surface, self.any_other = True in on_surface, False in on_surface
+
+    def counts(self, emitter: mi.Emitter) -> bool:
+        """Are the shadows in its light sampled?"""
+        return throws_shadows(emitter)
 
     def __len__(self) -> int:
         """Number of lights."""
@@ -95,7 +99,9 @@ class ShadowBoundary:
             projection = Projection(sensor)
             placement = silhouettes.placement()
         with dr.suspend_grad():
-            light = self._point_on_light(tracer.scene, sensor, sampler)
+            choice = (dr.arange(mi.Float, count) + sampler.next_1d()) * (len(self) / count)
+            time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
+            light = self._point_on_light(tracer.scene, choice, time, sampler)
             edge = self._edge(placement, light, sampler)
             shadow = _fall(tracer.scene, light, edge)
             view = _look(tracer, projection, sensor, sampler, light.time, shadow)
@@ -103,8 +109,11 @@ class ShadowBoundary:
 
             # ---------------------- The boundary on the film ----------------------
 
+            on_film = lambda v: projection.tangent(
+                shadow.x, mi.Point3f(shadow.x + v), mi.Float(0), view.aperture_sample
+            )
             tangent, towards_light = (
-                _on_film(v, projection, light, edge, shadow, view) for v in (edge.tangent, edge.lit)
+                dr.detach(on_film(_thrown(v, light, edge, shadow))) for v in (edge.tangent, edge.lit)
             )
             n_dl = mi.Vector2f(-tangent.y, tangent.x) / (edge.sample.density * light.density * (count / len(self)))
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
@@ -117,28 +126,33 @@ class ShadowBoundary:
                 dr.eval(jump, n_dl, active, view.seen, view.ray, met, shadow.onwards, kept, u)
 
         with dr.resume_grad():
-            p = silhouettes.point(placement, edge.sample, light.y, light.far).p
-            q = self._follow(tracer.scene, light, shadow.onwards, met, active)
             m = material_point(view.ray, view.seen, active).p
-            # From the light past the edge to the plane in which the shadow falls. (Its turning is of second order.)
-            d = dr.select(light.far, -mi.Vector3f(q), p - q)
-            origin = dr.select(light.far, p, q)
-            s = (dr.dot(shadow.facing, m - origin) + shadow.lift) / dr.dot(shadow.facing, d)
-            x = mi.Point3f(origin + dr.select(active, s, 1) * d - shadow.facing * shadow.lift)
+            x = self._moving(tracer.scene, placement, light, edge, shadow, m, met, active)
             moved = projection.film(x, view.aperture_sample).position()
             value = jump * dr.dot(n_dl, dr.select(active, moved - dr.detach(moved), 0))
             return ShadowSamples(u, value, view.ray.wavelengths, light.light)
 
+    def _moving(self, scene, placement: Placement, light, edge, shadow, m: mi.Point3f, met, active) -> mi.Point3f:
+        """Where the shadow falls, attached to the light, the edge, and the material point m of what it falls on.
+
+        met : what the ray from there to the light meets.
+        """
+        p = self.silhouettes.point(placement, edge.sample, light.y, light.far).p
+        q = self._follow(scene, light, shadow.onwards, met, active)
+        # From the light past the edge to the plane in which the shadow falls. (Its turning is of second order.)
+        d = dr.select(light.far, -mi.Vector3f(q), p - q)
+        origin = dr.select(light.far, p, q)
+        s = (dr.dot(shadow.facing, m - origin) + shadow.lift) / dr.dot(shadow.facing, d)
+        return mi.Point3f(origin + dr.select(active, s, 1) * d - shadow.facing * shadow.lift)
+
     # ---------------------- From a light to an edge ----------------------
 
-    def _point_on_light(self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler) -> _LightPoint:
-        count = sampler.wavefront_size()
-        choice = (dr.arange(mi.Float, count) + sampler.next_1d()) * (len(self) / count)
+    def _point_on_light(self, scene: mi.Scene, choice: mi.Float, time: mi.Float, sampler: mi.Sampler) -> _LightPoint:
+        """choice : uniform from 0 to the number of lights."""
         which = dr.minimum(mi.UInt32(choice), len(self) - 1)
         choice = dr.clip(choice - which, 0, dr.one_minus_epsilon(mi.Float))
         light = dr.gather(mi.UInt32, self.chosen, which)
         emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.lights.emitter, light))
-        time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
         numbers = sampler.next_2d()
         on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
         far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) if self.any_other else mi.Bool(False)
@@ -270,7 +284,8 @@ class _Shadow:
     """Where the shadow of that point falls.
 
     x : mi.Point3f, a little off the surface. facing : its normal, on the side of the light. lift : how high above it
-    rays start. shape : of the surface. onwards : a ray past the edge to the light.
+    rays start. shape : of the surface. onwards : a ray past the edge to the light. ray, fallen : the one from there,
+    and what it meets.
     """
 
     x: mi.Point3f
@@ -278,6 +293,8 @@ class _Shadow:
     lift: mi.Float
     shape: mi.ShapePtr
     onwards: mi.Ray3f
+    ray: mi.Ray3f
+    fallen: mi.PreliminaryIntersection3f
     active: mi.Bool
 
 
@@ -310,7 +327,7 @@ def _fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
     x = mi.Point3f(hit.p - aside - ω * along - facing * lift)
     towards_light = dr.select(far, -ω, dr.normalize(light.y - p - aside))
     onwards = mi.Ray3f(p + aside, towards_light, light.time, ray.wavelengths)
-    return _Shadow(x, facing, lift, fallen.shape, onwards, active)
+    return _Shadow(x, facing, lift, fallen.shape, onwards, ray, fallen, active)
 
 
 def _look(
@@ -340,11 +357,8 @@ def _look(
     return _View(u, ray, weight, seen, si, aperture_sample, active)
 
 
-def _on_film(
-    v: mi.Vector3f, projection: Projection, light: _LightPoint, edge: _Edge, shadow: _Shadow, view: _View
-) -> mi.Vector2f:
-    """How the shadow moves on the film if the point of the edge moves by v: pixels."""
-    x, facing, d = shadow.x, shadow.facing, edge.d
-    s = dr.select(light.far, 1, dr.dot(facing, x + facing * shadow.lift - light.y) / dr.dot(facing, d))
-    v = s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))
-    return dr.detach(projection.tangent(x, mi.Point3f(x + v), mi.Float(0), view.aperture_sample))
+def _thrown(v: mi.Vector3f, light: _LightPoint, edge: _Edge, shadow: _Shadow) -> mi.Vector3f:
+    """How the shadow moves over what it falls on if the point of the edge moves by v."""
+    facing, d = shadow.facing, edge.d
+    s = dr.select(light.far, 1, dr.dot(facing, shadow.x + facing * shadow.lift - light.y) / dr.dot(facing, d))
+    return s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))

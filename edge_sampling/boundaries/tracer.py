@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import drjit as dr
 import mitsuba as mi
+
+from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .horizon import Horizon
 
@@ -15,16 +16,22 @@ from .horizon import Horizon
 class ShadingPoint:
     """Points at which light is reflected towards the sensor, one of each path.
 
-    si : mi.SurfaceInteraction3f, (N,), attached to whatever moves it.
+    si : mi.SurfaceInteraction3f, (N,). Its `p` and `n` are attached to whatever moves them.
     depth : mi.UInt32, number along the path; 1 is what the sensor sees.
     β : mi.Spectrum, throughput up to there, over the probability of this point among those of its path. Detached.
     active : mi.Bool, is there one?
+    slides : mi.Bool, may it move with the vertices before, though its surface stands still?
+    vicinity : in which the next vertex slides.
+    density : mi.Float, by area, with which it was found from the vertex before; infinite if that is a mirror. Detached.
     """
 
     si: mi.SurfaceInteraction3f
     depth: mi.UInt32
     β: mi.Spectrum
     active: mi.Bool
+    slides: mi.Bool
+    vicinity: Vicinity
+    density: mi.Float
 
 
 class Tracer(Protocol):
@@ -55,20 +62,3 @@ class Tracer(Protocol):
         active: mi.Bool,
     ) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`."""
-
-
-def emitted_and_scattered(
-    tracer: Tracer,
-    ray: mi.Ray3f,
-    pi: mi.PreliminaryIntersection3f,
-    y: mi.SurfaceInteraction3f,
-    depth: mi.UInt32,
-    sampler: mi.Sampler,
-    active: mi.Bool,
-) -> mi.Spectrum:
-    """All light that arrives along a ray from a vertex of number `depth`, which meets y. Detached."""
-    L = y.emitter(tracer.scene, active).eval(y, active)
-    if tracer.scatters(2):
-        onwards = active & y.is_valid() & tracer.scatters(depth + 1)
-        L += dr.select(onwards, tracer.scattered(ray, pi, depth, sampler, onwards), 0)
-    return L

@@ -32,6 +32,7 @@ class Node:
     silhouettes : length of the edges that may be silhouettes, scene units.
     always : length of the edges that are boundaries from wherever they are seen: open ones, and where more than two
         faces meet.
+    creases : length of the others across which what is seen may jump, though both faces are seen.
     lower, upper : box around them.
     mean : of the planes of `silhouettes`, weighted by length.
     variance : of the same: 10 numbers, the upper triangle of a symmetric matrix.
@@ -41,6 +42,7 @@ class Node:
 
     silhouettes: mi.Float
     always: mi.Float
+    creases: mi.Float
     lower: list[mi.Float]
     upper: list[mi.Float]
     mean: list[mi.Float]
@@ -50,44 +52,46 @@ class Node:
     plane_upper: list[mi.Float]
 
     def pack(self) -> list[mi.Vector4f]:
-        """In ten packets, as they are stored."""
-        numbers = [self.silhouettes, self.always]
-        for field in fields(self)[2:]:
+        """In packets, as they are stored."""
+        numbers = [self.silhouettes, self.always, self.creases]
+        for field in fields(self)[3:]:
             numbers += getattr(self, field.name)
+        numbers += [mi.Float(0)] * (4 * NODE_PACKETS - len(numbers))
         return [mi.Vector4f(*numbers[i : i + 4]) for i in range(0, len(numbers), 4)]
 
     @staticmethod
     def unpack(packets: list[mi.Vector4f]) -> Node:
         numbers = [x for packet in packets for x in packet]
-        parts, start = [], 2
+        parts, start = [], 3
         for size in (3, 3, 4, 10, 10, 4, 4):
             parts.append(numbers[start : start + size])
             start += size
-        return Node(numbers[0], numbers[1], *parts)
+        return Node(*numbers[:3], *parts)
 
 
 #: Packets of four numbers that make a `Node`, and an edge in a leaf.
-NODE_PACKETS, SLOT_PACKETS = 10, 4
+NODE_PACKETS, SLOT_PACKETS = 11, 4
 
 
 @dataclass
 class Slot:
-    """An edge in a leaf: end points relative to the centre of the tree, its two planes, and 1 if it is always a
-    boundary, 0 if as a silhouette only."""
+    """An edge in a leaf: end points relative to the centre of the tree, its two planes; 1 if it is always a boundary, 0
+    if as a silhouette only; and 1 if it is a crease, see `Node`."""
 
     a: mi.Vector3f
     b: mi.Vector3f
     planes: tuple[mi.Vector4f, mi.Vector4f]
     always: mi.Float
+    crease: mi.Float
 
     def pack(self) -> list[mi.Vector4f]:
         a, b = self.a, self.b
-        return [*self.planes, mi.Vector4f(a.x, a.y, a.z, self.always), mi.Vector4f(b.x, b.y, b.z, 0)]
+        return [*self.planes, mi.Vector4f(a.x, a.y, a.z, self.always), mi.Vector4f(b.x, b.y, b.z, self.crease)]
 
     @staticmethod
     def unpack(packets: list[mi.Vector4f]) -> Slot:
         p, q, a, b = packets
-        return Slot(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(b.x, b.y, b.z), (p, q), a.w)
+        return Slot(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(b.x, b.y, b.z), (p, q), a.w, b.w)
 
 
 class EdgeTree:
@@ -190,7 +194,8 @@ class EdgeTree:
             planes[k] = dr.select(always, mi.Vector4f(0, 0, 0, d), planes[k])
         usable = self._used & dr.isfinite(dr.squared_norm(a)) & dr.isfinite(dr.squared_norm(b))
         a, b = dr.select(usable, a, 0), dr.select(usable, b, 0)
-        return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), mi.Float(always & usable))
+        crease = usable & ~always & device_edges.is_crease(edge, dr.norm(dr.cross(flat[0], flat[1])))
+        return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), mi.Float(always & usable), mi.Float(crease))
 
     def _leaf(self, first: mi.UInt32) -> Node:
         nodes = [self._single(self.slot(first + k)) for k in range(LEAF)]
@@ -211,6 +216,7 @@ class EdgeTree:
         return Node(
             length * (1 - s.always),
             length * s.always,
+            length * s.crease,
             widest(dr.minimum, dr.inf),
             widest(dr.maximum, -dr.inf),
             list(0.5 * (q + r)),
@@ -237,6 +243,7 @@ def _merge(p: Node, q: Node) -> Node:
     return Node(
         total,
         p.always + q.always,
+        p.creases + q.creases,
         pairwise(dr.minimum, p.lower, q.lower),
         pairwise(dr.maximum, p.upper, q.upper),
         blend(p.mean, q.mean),

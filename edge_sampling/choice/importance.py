@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .edge_tree import EDGE_ON, Node, Slot
-from .on_edge import MARGIN, along_and_off, falloff, in_cone, narrow
+from .on_edge import MARGIN, along_and_off, falloff, is_silhouette, narrow, part_in_view
 from .views import View
 
 #: Part of the length of a node that counts even where its moments promise no silhouette.
@@ -34,15 +34,18 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
     # Planes are not normally distributed: this falls off like the exponential at first, but has a heavier tail.
     tail = dr.rcp(dr.square(dr.square(1 + 0.125 * mean * mean / variance)))
     silhouettes = dr.minimum(dr.sqrt(difference / variance) * dr.inv_pi * tail, 1)
-    length = node.always + node.silhouettes * (silhouettes + FLOOR)
+    length = dr.select(possible, node.always + node.silhouettes * (silhouettes + FLOOR), 0)
 
     lower, upper = mi.Vector3f(node.lower), mi.Vector3f(node.upper)
     half = 0.5 * view.w * (upper - lower)
     d = 0.5 * view.w * (upper + lower) - view.p
+    if view.vicinity is not None:
+        outside = dr.maximum(dr.abs(d) - half, 0)
+        length += node.creases * (1 - view.vicinity.far(dr.squared_norm(outside)))
     size2 = dr.squared_norm(half)
     r2 = dr.squared_norm(d) + size2
     above = dr.dot(view.n, d) + dr.dot(dr.abs(view.n), half)
-    possible &= (above > 0) | dr.all(view.n == 0)
+    possible = (above > 0) | dr.all(view.n == 0)
     cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(above * dr.rsqrt(r2), 0, 1))
     weight = view.wide * cosine
     for lobe in view.lobes:
@@ -69,12 +72,16 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
 
 def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     """What `importance` is for a node, for a single edge. Zero where that is no boundary."""
-    y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -view.w)
-    signs = [dr.dot(q, y) for q in slot.planes]
-    edge_on = EDGE_ON * dr.norm(view.w * slot.a - view.p)
-    a, b, start, end = in_cone(slot, view)
+    a, b, start, end = part_in_view(slot, view)
     length_a, length_b = dr.norm(a), dr.norm(b)
-    boundary = (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
+    boundary = is_silhouette(slot, view)
+    near = mi.Float(1)
+    if view.vicinity is not None:
+        # As near as the part in view comes.
+        e = b - a
+        t = dr.clip(-dr.dot(a, e) / dr.squared_norm(e), 0, 1)
+        near = dr.select(boundary, 1, slot.crease * (1 - view.vicinity.far(dr.squared_norm(a + t * e))))
+        boundary |= near > 0
     above = [dr.dot(view.n, v) for v in (a, b)]
     everywhere = dr.all(view.n == 0)
     boundary &= (above[0] > EDGE_ON * length_a) | (above[1] > EDGE_ON * length_b) | everywhere
@@ -95,6 +102,7 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
         across = dr.select(view.far, dr.norm(dr.cross(slot.b - slot.a, view.p)), across)
         result = dr.select(view.far, view.wide * across, result)
     boundary &= (across > 0) & (start < end)
+    result *= near
     return dr.select(boundary & dr.isfinite(result), result, 0)
 
 

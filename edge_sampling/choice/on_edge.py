@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .edge_tree import Slot
-from .views import Lobe, View
+from .edge_tree import EDGE_ON, Slot
+from .views import Cone, Lobe, View
 
 #: Added to the cosine of an edge, by whether a light looks: it stands for all of the edge, and the normal at a shading
 #: point may be that of the face, not of the shading.
@@ -93,7 +93,7 @@ def narrow(lobe: Lobe, a: mi.Vector3f, e: mi.Vector3f, length: mi.Float, h: mi.F
 
 def sample_point(slot: Slot, view: View, choice: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Parameter t of a point on the edge, and its density."""
-    a, b, start, end = in_cone(slot, view)
+    a, b, start, end = part_in_view(slot, view)
     length = dr.norm(b - a)
     densities = _on_line(a, b, view)
     total = sum(d.total for d in densities)
@@ -107,14 +107,45 @@ def sample_point(slot: Slot, view: View, choice: mi.Float, u: mi.Float) -> tuple
     return (t, pdf) if view.far is None else (dr.select(view.far, u, t), dr.select(view.far, 1, pdf))
 
 
-def in_cone(slot: Slot, view: View) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Float]:
-    """The part of an edge that is in the cone of the view: its ends, seen from the viewer, and its interval of t. Where
-    there is none, the ends are equal."""
+def is_silhouette(slot: Slot, view: View) -> mi.Bool:
+    """Do the faces of an edge lie on either side of the plane through it and the viewer, or is it one from anywhere?"""
+    y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -view.w)
+    signs = [dr.dot(q, y) for q in slot.planes]
+    edge_on = EDGE_ON * dr.norm(view.w * slot.a - view.p)
+    return (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
+
+
+def part_in_view(slot: Slot, view: View) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Float]:
+    """The part of an edge that counts in a view: inside of its cone, and of its vicinity if the edge is no silhouette.
+    Its ends, seen from the viewer, and its interval of t. Where there is none, the ends are equal."""
     a, b = view.w * slot.a - view.p, view.w * slot.b - view.p
-    if view.cone is None:
-        return a, b, mi.Float(0), mi.Float(1)
-    cone = view.cone
     e = b - a
+    start, end = (mi.Float(0), mi.Float(1)) if view.cone is None else _in_cone(a, e, view.cone)
+    if view.vicinity is not None:
+        near, far = _in_ball(a, e, view.vicinity.radius)
+        everywhere = is_silhouette(slot, view)
+        start, end = (
+            dr.select(everywhere, start, dr.maximum(start, near)),
+            dr.select(everywhere, end, dr.minimum(end, far)),
+        )
+        end = dr.maximum(start, end)
+    if view.cone is None and view.vicinity is None:
+        return a, b, start, end
+    return a + start * e, a + end * e, start, end
+
+
+def _in_ball(a: mi.Vector3f, e: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Where a + t e is within a ball about the origin: an interval in [0, 1]; with equal ends if nowhere."""
+    e2 = dr.squared_norm(e)
+    middle = -dr.dot(a, e) / e2
+    half2 = (dr.square(radius) - dr.squared_norm(a + middle * e)) / e2
+    half = dr.safe_sqrt(half2)
+    start, end = dr.clip(middle - half, 0, 1), dr.clip(middle + half, 0, 1)
+    return start, dr.select(half2 > 0, end, start)
+
+
+def _in_cone(a: mi.Vector3f, e: mi.Vector3f, cone: Cone) -> tuple[mi.Float, mi.Float]:
+    """Where a + t e is in a cone about the origin: an interval in [0, 1]; with equal ends if nowhere."""
     # In the cone, off² cos² - along² sin² <= 0 and along > 0. As a function of t, that is A t² + 2 B t + C.
     a_along, e_along = dr.dot(cone.axis, a), dr.dot(cone.axis, e)
     a_off, e_off = a - cone.axis * a_along, e - cone.axis * e_along
@@ -136,8 +167,7 @@ def in_cone(slot: Slot, view: View) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float,
     nothing = between & ((discriminant < 0) | ((e_along == 0) & (a_along < 0)))
     start, end = dr.clip(start, 0, 1), dr.clip(end, 0, 1)
     end = dr.select(nothing, start, dr.maximum(start, end))
-    start, end = dr.select(cone.everything, 0, start), dr.select(cone.everything, 1, end)
-    return a + start * e, a + end * e, start, end
+    return dr.select(cone.everything, 0, start), dr.select(cone.everything, 1, end)
 
 
 def along_and_off(axis: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Float]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.parametrisation import Vicinity
+
 
 @dataclass
 class Lobe:
@@ -45,6 +47,7 @@ class View:
     lobes : around which there is more.
     cone : outside of which there is nothing; None: all directions count.
     far : mi.Bool, is the viewer at infinity? None: nowhere. Not with lobes or cones.
+    vicinity : in which creases count, too, and the less the farther they are; None: nowhere.
     """
 
     p: mi.Vector3f
@@ -53,6 +56,7 @@ class View:
     lobes: list[Lobe]
     cone: Cone | None = None
     far: mi.Bool | None = None
+    vicinity: Vicinity | None = None
 
     @property
     def w(self) -> mi.Float | float:

@@ -18,7 +18,7 @@ from rimlight.edge_sampling import Horizon, Lights
 from rimlight.edge_sampling.boundaries.horizon import turn_to_side
 from rimlight.edge_sampling.parametrisation import look_from, material_point, seen_by_camera
 from rimlight.transport.paths import Vertex, step
-from rimlight.transport.scattering import Scattering
+from rimlight.transport.scattering import Numbers, Scattering
 from rimlight.transport.tracer import PathTracer
 
 from ._sinks import wide
@@ -218,12 +218,13 @@ class LightPaths:
     def _onwards(self, to, scattering, place, η, sampler, active) -> tuple[Place, mi.Float, mi.Bool]:
         """The next vertex, and what it emits."""
         si = place.surface(scattering, active)
-        emitted, onwards = scattering.sample_bsdf(si, si.bsdf(place.ray), sampler, active)
+        numbers = Numbers(mi.Point2f(0), sampler.next_1d(active), sampler.next_2d(active))
+        emitted, onwards = scattering.sample_bsdf(si, si.bsdf(place.ray), numbers, active)
         light = None
         if scattering.any_hit_by_rays:
             y = onwards.pi.compute_surface_interaction(onwards.ray, mi.RayFlags.Minimal, active)
             light = scattering.number(y.emitter(self.scene))
-        vertex = Vertex(place.ray, place.pi, place.number, place.throughput, η)
+        vertex = Vertex(place.ray, place.pi, place.number, place.throughput, η, mi.Bool(False))
         after, goes_on = step(vertex, onwards, sampler, self.depths, active)
         # What Russian roulette divides by belongs to the throughput.
         with dr.resume_grad(when=to.attached):

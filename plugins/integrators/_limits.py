@@ -90,18 +90,7 @@ def lasting_limits(
 def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool) -> list[str]:
     """What lacks of the light that surfaces reflect."""
     limits = []
-    if from_points:
-        delta = any(
-            e.flags() & mi.EmitterFlags.Delta or (hasattr(e, "light_count") and dr.any(e.angular_radius == 0))
-            for e in scene.emitters()
-        )
-        if delta and depths.scatters(2):
-            limits.append(
-                "the derivative has the hard shadows of lights without size (point, spot, directional, ...) on what "
-                "the camera sees, but lacks those in indirect light; give the lights a size, or set "
-                '"max_depth" to 2 to leave it out.'
-            )
-    elif depths.scatters(2) or scene.environment() is not None:
+    if not from_points and (depths.scatters(2) or scene.environment() is not None):
         limits.append(
             "the derivative has the shadows that lights throw on what the camera sees, but lacks those of the "
             'environment and all that edges do to indirect light; set "sppi" to 0 to accept this.'

@@ -14,6 +14,7 @@ from rimlight.edge_sampling import (
     FacePlanes,
     FilmBoundary,
     Geometry,
+    IndirectShadows,
     Lights,
     ShadingBoundary,
     ShadowBoundary,
@@ -141,26 +142,27 @@ class BoundarySearch:
         film = FilmBoundary(self.geometry, self.edges, on_film, lights, soft=soft) if on_film.any() else None
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
-        shadows, shading = self._in_reflected_light(scene, moving, sppi)
+        shadows, shading, indirect = self._in_reflected_light(scene, moving, sppi)
         abilities = {"planes": self.planes, "from_points": self.from_points}
         limits = lasting_limits(scene, self.geometry, self.edges, self.depths, moving, sppi, **abilities)
-        return Boundaries(film, shadows, shading, planes, moving.flags, moving.camera, moving.lights, limits)
+        return Boundaries(film, shadows, shading, indirect, planes, moving.flags, moving.camera, moving.lights, limits)
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int
-    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None]:
+    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, IndirectShadows | None]:
         """What samples the edges of which lights and shading points know, as far as it is needed."""
         if not sppi or not scene.emitters() or not self.depths.scatters(1):
-            return None, None
+            return None, None, None
         everything = moving.camera or moving.lights
         silhouettes = Silhouettes(self.geometry, self.edges, None if everything else moving.flags)
         if not len(silhouettes):
-            return None, None
-        shadows, shading = ShadowBoundary(scene, silhouettes), None
+            return None, None, None
+        shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, None
         if self.from_points:
             shading = ShadingBoundary(scene, silhouettes, None if everything else list(moving.shapes))
             shading = shading if self.depths.scatters(2) or shading.emission_at_first else None
-        return shadows if len(shadows) else None, shading
+            indirect = IndirectShadows(scene, silhouettes) if self.depths.scatters(2) else None
+        return shadows if len(shadows) else None, shading, indirect if indirect and len(indirect) else None
 
     def _face_planes(self, scene: mi.Scene, moving: Moving) -> FacePlanes | None:
         """What samples the planes of faces, if what they hide can change: where the faces move, or what lights them.

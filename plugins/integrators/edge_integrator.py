@@ -103,13 +103,13 @@ class EdgeIntegrator(ADIntegrator):
                 term = make()
                 with dr.resume_grad():
                     # A parameter that carries a gradient may well not show in the image: then the derivative is zero.
-                    first = term.replay.first if term.replay is not None else mi.Point3f(0)
-                    value, first = dr.forward_to(
-                        [term.value, first], flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+                    start = term.replay.start if term.replay is not None else mi.Float(0)
+                    value, start = dr.forward_to(
+                        [term.value, start], flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
                     )
                 term = term.detached()
                 if term.replay is not None:
-                    value.L += term.throughput * term.replay.forward(first)
+                    value.L += term.throughput * term.replay.forward(start)
                 terms.append(term)
                 values.append(value)
             image = self._develop(job.sensor.film(), terms, values)
@@ -138,16 +138,14 @@ class EdgeIntegrator(ADIntegrator):
                     gradient = dr.grad(value)
                     if term.replay is not None:
                         with dr.suspend_grad():
-                            first = term.replay.backward(gradient.L * term.throughput)
-                        if first is not None:
-                            dr.set_grad(term.replay.first, first)
-                            dr.enqueue(dr.ADMode.Backward, term.replay.first)
+                            start = term.replay.backward(gradient.L * term.throughput)
+                        dr.set_grad(term.replay.start, start)
+                        dr.enqueue(dr.ADMode.Backward, term.replay.start)
                     dr.set_grad(term.value, gradient)
                     dr.enqueue(dr.ADMode.Backward, term.value)
                 dr.traverse(dr.ADMode.Backward)
-                for term in terms:
-                    if term.rays is not None:
-                        term.rays.backward()
+                for cut in (cut for term in terms for cut in term.cuts):
+                    cut.backward()
             dr.eval()
         report_gradients(self.name, params)
 

@@ -48,19 +48,18 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     Renders what ``path`` renders, and differentiates it with respect to what ``direct_edge`` differentiates. At
     ``max_depth`` 2 they are the same.
 
-    **Interior.** The part of a path behind its first vertex is differentiated by path replay (Vicini et al. 2021):
-    memory does not grow with the number of bounces. All its vertices are *material points*, which follow their surfaces
-    (Zhang et al. 2020); the first is met by a ray that is fixed on the film.
+    **Interior.** The first vertex of a path is met by a ray that is fixed on the film. Others are *material points*,
+    which follow their surfaces (Zhang et al. 2020), but close to the vertex before, they slide, since there the
+    direction is held: so contacts and corners have a finite variance, but for a logarithm. In backward mode, paths are
+    written down, 84 bytes for each vertex and sample, and visited again from their end.
 
     **Boundaries at shading points.** Each path keeps *one* of its vertices, chosen by a reservoir in proportion to
-    throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows on
-    what the camera sees, hard ones too, are found from the lights.
+    throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows, hard
+    ones too, are found from the lights, on what the camera sees, and on what lights that.
 
-    **Limits.** Those of ``direct_edge``, but for interreflections; what perfect mirrors and glass show is taken not to
-    move, and part of what is seen through masks, with a warning. Where something that moves touches something else,
-    and in corners of rooms when the camera moves, light that bounces between the two has a derivative of infinite
-    variance; for some of these integrals, not even the mean of the absolute value is finite. There, single pixels are
-    wrong by arbitrary amounts, and more samples help slowly or not at all.
+    **Limits.** Those of ``direct_edge``, but for interreflections; the edges in what perfect mirrors and glass show are
+    missing, and part of what is seen through masks, with a warning. With ``max_depth`` above 32 or -1, the vertices
+    of paths are counted before they are written down, which ``dr.freeze`` cannot record in a derivative.
 
     .. tabs::
         .. code-tab:: xml

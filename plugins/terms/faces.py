@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
+from rimlight.transport.replay import ChosenVertex
 
 from .points import FromPoints
 from .term import Job
@@ -24,8 +25,10 @@ class FacePlanesTerm(FromPoints):
     def boundary(self, job: Job) -> object | None:
         return job.boundaries.planes
 
-    def reflected(self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float) -> mi.Spectrum:
-        point = job.tracer.point(ray, sampler)
+    def reflected(
+        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, ChosenVertex | None]:
+        point, chosen = job.tracer.point(ray, sampler, job.mode)
         L = job.boundaries.planes.sample(job.tracer, point, sampler)
         with dr.resume_grad():
-            return L * point.β
+            return L * point.β, chosen

@@ -37,4 +37,4 @@ class InteriorTerm(Term):
         with dr.resume_grad():
             value = Sample(mi.Spectrum(found.L * ray_weight), mi.Float(0))
         weight = dr.detach(ray_weight)
-        return FilmSamples(position, value, ray.wavelengths, 1.0, job.weights, found.rest, weight, rays)
+        return FilmSamples(position, value, ray.wavelengths, 1.0, job.weights, found.rest, weight, (rays,))

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from .faces import FacePlanesTerm
 from .film import FilmTerm
+from .indirect import IndirectShadowsTerm
 from .interior import InteriorTerm
 from .points import PointsTerm
 from .shadows import ShadowsTerm
 from .term import Term
 
 #: In this order: path replay, in the first, needs that nothing else is attached to the parameters.
-TERMS: tuple[Term, ...] = (InteriorTerm(), FilmTerm(), ShadowsTerm(), PointsTerm(), FacePlanesTerm())
+TERMS: tuple[Term, ...] = (
+    InteriorTerm(),
+    FilmTerm(),
+    ShadowsTerm(),
+    PointsTerm(),
+    IndirectShadowsTerm(),
+    FacePlanesTerm(),
+)

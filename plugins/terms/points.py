@@ -9,8 +9,11 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
-from rimlight.edge_sampling import stratified
+from rimlight.edge_sampling import Silhouettes, stratified
+from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
+from rimlight.edge_sampling.choice.silhouettes import Placement
 from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.replay import ChosenVertex
 
 from .sampling import over_film, seed_of
 from .shadows import nothing_at_points
@@ -29,18 +32,22 @@ class FromPoints(Term):
         ray, ray_weight, position = job.sample_rays(sampler)
         choice = stratified(sampler, seed)
         rays = CutRays(job.mode)
-        L = self.reflected(job, rays(ray), sampler, choice)
+        L, chosen = self.reflected(job, rays(ray), sampler, choice)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(L * ray_weight * (job.weights / spp)), mi.Float(0))
-            return FilmSamples(position, value, ray.wavelengths, 0.0, spp, rays=rays)
+        cuts = (rays,) if chosen is None else (chosen, rays)
+        return FilmSamples(position, value, ray.wavelengths, 0.0, spp, cuts=cuts)
 
     @abstractmethod
     def boundary(self, job: Job) -> object | None:
         """What is sampled; None: nothing."""
 
     @abstractmethod
-    def reflected(self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float) -> mi.Spectrum:
-        """What the boundary does to the light along camera rays: mi.Spectrum, (N,), zero, with its gradient.
+    def reflected(
+        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, ChosenVertex | None]:
+        """What the boundary does to the light along camera rays: mi.Spectrum, (N,), zero, with its gradient; and what
+        hands on the gradients of points, see `PathTracer.point`.
 
         choice : uniform in [0, 1), stratified.
         """
@@ -61,11 +68,23 @@ class PointsTerm(FromPoints):
     def boundary(self, job: Job) -> object | None:
         return job.boundaries.shading
 
-    def reflected(self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float) -> mi.Spectrum:
-        shading = job.boundaries.shading
+    def reflected(
+        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, ChosenVertex | None]:
+        silhouettes = job.boundaries.shading.silhouettes
+        placement, point, chosen = placement_and_point(job, silhouettes, ray, sampler)
+        L = job.boundaries.shading.sample(job.tracer, placement, point, sampler, choice)
         with dr.resume_grad():
-            placement = shading.silhouettes.placement()
-        point = job.tracer.point(ray, sampler)
-        L = shading.sample(job.tracer, placement, point, sampler, choice)
-        with dr.resume_grad():
-            return L * point.β
+            return L * point.β, chosen
+
+
+def placement_and_point(
+    job: Job, silhouettes: Silhouettes, ray: mi.Ray3f, sampler: mi.Sampler, beyond: int = 0
+) -> tuple[Placement, ShadingPoint, ChosenVertex | None]:
+    """Where the shapes are, and a point of each path, as `PathTracer.point` has it."""
+    find = lambda: job.tracer.point(ray, sampler, job.mode, beyond=beyond)
+    # The motion of a chain is found at once, in forward mode: then nothing else may be attached to the shapes yet.
+    found = find() if job.tracer.scatters(2) and job.mode == dr.ADMode.Forward else None
+    with dr.resume_grad():
+        placement = silhouettes.placement()
+    return placement, *(found or find())

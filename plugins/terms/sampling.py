@@ -9,7 +9,7 @@ import mitsuba as mi
 #: What the seed of a call is changed by for each term (exclusive or), so that no two share their random numbers. The
 #: interior term has the seed itself: its samples are those of the image.
 SALT = {"film boundary": 0xFFFFFFFF, "shadows from lights": 0xAAAAAAAA, "edges from points": 0x55555555}
-SALT["planes of faces"] = 0x33333333
+SALT |= {"planes of faces": 0x33333333, "shadows in indirect light": 0x99999999}
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
 LINE = 16

@@ -15,7 +15,7 @@ from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart, film_parts
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.transport.cut_rays import CutRays
-from rimlight.transport.paths import Replay
+from rimlight.transport.replay import ChosenVertex, Replay
 from rimlight.transport.tracer import PathTracer
 
 from .sampling import Counts, per_pixel, size
@@ -42,7 +42,7 @@ class FilmSamples:
     per_pixel : how many neighbours in the wavefront belong to one pixel, 0 if they are in no order.
     replay : None, or what differentiates the part of the path that `value` is not attached to.
     throughput : of the camera ray, which weighs that part.
-    rays : None, or the cut between `value` and the sensor.
+    cuts : where `value` is cut from what it depends on: they hand gradients on in backward mode, one after the other.
     """
 
     position: mi.Point2f
@@ -52,7 +52,7 @@ class FilmSamples:
     per_pixel: int
     replay: Replay | None = None
     throughput: mi.Spectrum | None = None
-    rays: CutRays | None = None
+    cuts: tuple[ChosenVertex | CutRays, ...] = ()
 
     def detached(self) -> FilmSamples:
         return replace(self, value=dr.detach(self.value))

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below
-from rimlight.edge_sampling.parametrisation import Parametrisation, shown_by_mirror
+from rimlight.edge_sampling.parametrisation import Parametrisation, Vicinity, shown_by_mirror
 
 
 @dataclass
@@ -20,6 +20,8 @@ class Next:
     weight : throughput, mi.Spectrum; attached where wanted.
     η : relative index of refraction along the ray.
     through : mi.Bool, does the ray go on as if nothing was there?
+    mirrored : mi.Bool, is its direction that of a perfect mirror, or of a smooth glass?
+    moving : the same ray, as it moves with the surface; attached where wanted. Only given where the next vertex slides.
     """
 
     ray: mi.Ray3f
@@ -27,6 +29,17 @@ class Next:
     weight: mi.Spectrum
     η: mi.Float
     through: mi.Bool
+    mirrored: mi.Bool
+    moving: mi.Ray3f | None = None
+
+
+@dataclass
+class Numbers:
+    """Random numbers of one vertex: for a point on a light, a lobe of the BSDF, and a direction."""
+
+    light: mi.Point2f
+    lobe: mi.Float
+    direction: mi.Point2f
 
 
 class Scattering:
@@ -63,16 +76,31 @@ class Scattering:
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
 
-    def scatter(self, si, bsdf, sampler, active) -> tuple[mi.Spectrum, Next | None]:
-        """Direct illumination that `si` reflects, and the next vertex."""
-        from_emitter = self.sample_emitter(si, bsdf, sampler, active) if self.any else 0
-        from_bsdf, onwards = self.sample_bsdf(si, bsdf, sampler, active)
+    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Numbers:
+        light = sampler.next_2d(active) if self.any else mi.Point2f(0)
+        return Numbers(light, sampler.next_1d(active), sampler.next_2d(active))
+
+    def scatter(
+        self,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        numbers: Numbers,
+        active: mi.Bool,
+        vicinity: Vicinity | None = None,
+        met: mi.PreliminaryIntersection3f | None = None,
+    ) -> tuple[mi.Spectrum, Next]:
+        """Direct illumination that `si` reflects, and the next vertex.
+
+        vicinity : in which that slides; None: it is a material point.
+        met : what the ray to it meets, if that is known.
+        """
+        from_emitter = self.sample_emitter(si, bsdf, numbers.light, active) if self.any else 0
+        from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met)
         with dr.resume_grad(when=self.attached):
             return from_bsdf + from_emitter, onwards
 
-    def sample_emitter(self, si, bsdf, sampler, active):
+    def sample_emitter(self, si, bsdf, sample: mi.Point2f, active):
         """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,)."""
-        sample = sampler.next_2d(active)
         towards_light = lambda active: self.scene.sample_emitter_direction(si, sample, False, active)
         return self.reflect(si, bsdf, towards_light, active)
 
@@ -140,16 +168,21 @@ class Scattering:
                 attached = dr.select(follows, at_moved, attached)
             return direction, dr.replace_grad(weight, attached), visible, to_lamp
 
-    def sample_bsdf(self, si, bsdf, sampler, active):
+    def sample_bsdf(
+        self,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        numbers: Numbers,
+        active: mi.Bool,
+        vicinity: Vicinity | None = None,
+        met: mi.PreliminaryIntersection3f | None = None,
+    ) -> tuple[mi.Spectrum, Next]:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
-        vertex."""
+        vertex. The arguments are those of `scatter`."""
         scene, context = self.scene, mi.BSDFContext()
-        sample1, sample2 = sampler.next_1d(active), sampler.next_2d(active)
-        bs, weight = bsdf.sample(context, si, sample1, sample2, active)
+        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, met)
+        ray, pi, weight, mirrored = onwards.ray, onwards.pi, onwards.weight, onwards.mirrored
         active = active & dr.any(weight != 0)
-        mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        pi = scene.ray_intersect_preliminary(ray, active=active)
         if not self.attached:
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         else:
@@ -161,20 +194,28 @@ class Scattering:
                 f = bsdf.eval(context, si, si.to_local(ω), active & ~mirrored)
                 attached = f * (dr.select(on_surface, to_y.geometry, 1) / bs.pdf)
                 attached = dr.select(to_y.still, dr.detach(attached), attached)
+                scattered = attached
+                if vicinity is not None:
+                    onwards.moving = mi.Ray3f(ray)
+                    onwards.moving.o = dr.replace_grad(ray.o, si.p)
+                    scattered = self._slide(si, bsdf, bs, ray, to_y, attached, vicinity, on_surface & ~mirrored)
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
-                    turned, at_mirror = bsdf.sample(context, si, sample1, sample2, active & mirrored)
+                    turned, at_mirror = bsdf.sample(context, si, numbers.lobe, numbers.direction, active & mirrored)
                     wrong = mi.Bool(False)
                     for other in self.by_density:
                         wrong |= bsdf == other
                     p = dr.detach(turned.pdf)
                     at_mirror *= dr.select(wrong & (p > 0), turned.pdf / dr.select(p > 0, p, 1), 1)
                     y = dr.select(mirrored, shown_by_mirror(si, turned.wo, ray, pi, active & mirrored), y)
-                    attached = dr.select(mirrored, at_mirror, attached)
+                    attached, scattered = (dr.select(mirrored, at_mirror, x) for x in (attached, scattered))
+                    if vicinity is not None:
+                        d = dr.select(mirrored & active, si.to_world(turned.wo), ray.d)
+                        onwards.moving.d = dr.replace_grad(ray.d, d)
+                onwards.weight = dr.replace_grad(weight, dr.select(active, scattered, 0))
                 weight = dr.replace_grad(weight, dr.select(active, attached, 0))
-        through = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if not self.any_hit_by_rays:
-            return mi.Spectrum(0), Next(ray, pi, weight, bs.eta, through)
+            return mi.Spectrum(0), onwards
         emitter = y.emitter(scene, active)
         ds = mi.DirectionSample3f(scene, y, si)
         pdf = self.pdf_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
@@ -185,7 +226,22 @@ class Scattering:
                 mis = to_y.attach(mis, bsdf_pdf, pdf, by_light=False)
             mis = dr.select(mirrored, 1, mis)
             Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
-        return Le, Next(ray, pi, weight, bs.eta, through)
+        return Le, onwards
+
+    @staticmethod
+    def _slide(si, bsdf, bs, ray, to_y, at_material, vicinity: Vicinity, active) -> mi.Spectrum:
+        """Throughput to a point that slides in the vicinity: `at_material`, with its part of the motion, and what is
+        held in its direction, with the rest."""
+        d = to_y.y.p - si.p
+        n = dr.detach(to_y.y.n)
+        cosine = dr.dot(ray.d, n)
+        active = active & ~to_y.still & (cosine != 0) & (vicinity.far(dr.detach(dr.squared_norm(d))) < 1)
+        # Along the ray, to the plane that moves with y.
+        along = dr.dot(d, n) / dr.select(active, cosine, 1)
+        at_direction = bsdf.eval(mi.BSDFContext(), si, si.to_local(ray.d), active) / bs.pdf
+        near = 1 - vicinity.far(dr.square(along))
+        total = vicinity.far(dr.squared_norm(d)) * at_material + near * at_direction
+        return dr.select(active, total, at_material)
 
     def stops(self, ray, pi, sampler, active) -> mi.Bool:
         """Does a ray meet a surface that it does not go through as if nothing was there?"""
@@ -227,6 +283,26 @@ class Scattering:
             mine = without & (emitter == mi.EmitterPtr(several))
             L = dr.select(mine, several.eval_background(y, mine), L)
         return L
+
+
+def next_vertex(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    numbers: Numbers,
+    active: mi.Bool,
+    met: mi.PreliminaryIntersection3f | None = None,
+) -> tuple[mi.BSDFSample3f, Next]:
+    """A direction sampled from the BSDF, and the vertex there. Detached.
+
+    met : what the ray to it meets, if that is known.
+    """
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, active)
+    active = active & dr.any(weight != 0)
+    ray = si.spawn_ray(si.to_world(bs.wo))
+    pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met
+    through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
+    return bs, Next(ray, pi, weight, bs.eta, active & through, mirrored)
 
 
 def divides_by_density(bsdf: mi.BSDF) -> bool:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
-from rimlight.edge_sampling.parametrisation import material_point, seen_by_camera
+from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
 
-from .paths import Depths, Replay, Vertex, choose_vertex, scattered_light
+from .paths import Depths, Vertex, scattered_light
+from .replay import ChosenVertex, Replay, Start
 from .scattering import Scattering
 
 
@@ -19,9 +20,9 @@ from .scattering import Scattering
 class Radiance:
     """Light along camera rays.
 
-    L : mi.Spectrum, (N,); where wanted, attached to the first vertex of its path.
+    L : mi.Spectrum, (N,). Where it is attached, only what the first vertex reflects directly.
     valid : mi.Bool, (N,); does the ray meet a surface, or a visible environment? The alpha channel.
-    rest : None, or what differentiates the rest of the path.
+    rest : None, or what differentiates the light that arrives by further vertices.
     """
 
     L: mi.Spectrum
@@ -83,22 +84,22 @@ class PathTracer:
 
         # ---------------------- Light that it scatters ----------------------
 
-        direct, onwards = scattering.scatter(si, bsdf, sampler, active)
+        vicinity = Vicinity.of(pi) if attached and self.scatters(2) else None
+        direct, onwards = scattering.scatter(si, bsdf, scattering.draw(sampler, active), active, vicinity)
         with dr.resume_grad(when=attached):
             L += direct
         valid = backdrop | (active & ~onwards.through)
         if not self.scatters(2):
             return Radiance(L, valid | scattering.stops(onwards.ray, onwards.pi, sampler, active & onwards.through))
-        first = _camera_vertex(ray, pi)
         β = dr.select(active, dr.detach(onwards.weight), 0)
-        second = Vertex(mi.Ray3f(onwards.ray), onwards.pi, first.depth + 1, β, mi.Float(onwards.η))
-        again = sampler.clone() if attached else None
+        detached, η = dr.detach(mi.Ray3f(onwards.ray)), mi.Float(onwards.η)
+        second = Vertex(detached, onwards.pi, dr.full(mi.UInt32, 2, dr.width(pi.t)), β, η, onwards.mirrored)
+        if attached:
+            with dr.resume_grad():
+                start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight))
+            return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active))
         indirect, stopped = scattered_light(scene, sampler, second, self.depths, active)
-        valid |= onwards.through & stopped
-        with dr.resume_grad(when=attached):
-            L += dr.select(β != 0, indirect * onwards.weight / β, 0)
-        rest = Replay(scene, again, first, second, self.depths, active, si.p, indirect) if attached else None
-        return Radiance(L, valid, rest)
+        return Radiance(L + dr.select(β != 0, indirect, 0), valid | (onwards.through & stopped))
 
     def first_hit(self, ray: mi.Ray3f, active: mi.Bool | bool) -> mi.PreliminaryIntersection3f:
         """What camera rays meet."""
@@ -118,28 +119,35 @@ class PathTracer:
 
     # ---------------------- From points of a path ----------------------
 
-    def point(self, ray: mi.Ray3f, sampler: mi.Sampler) -> ShadingPoint:
-        """One vertex of each path at which light is scattered."""
+    def point(
+        self, ray: mi.Ray3f, sampler: mi.Sampler, mode: dr.ADMode, *, beyond: int = 0
+    ) -> tuple[ShadingPoint, ChosenVertex | None]:
+        """One vertex of each path at which light is scattered; and what hands its gradient on in backward mode, if that
+        does not go by itself.
+
+        beyond : at least so many more vertices may follow it.
+        """
         pi = self.first_hit(ray, True)
-        vertex, chosen = _camera_vertex(ray, pi), pi.is_valid()
-        if self.scatters(2):
-            vertex, chosen = choose_vertex(self.scene, sampler, vertex, self.depths, chosen)
-        at_first = vertex.depth == 1
-        with dr.resume_grad():
-            si = seen_by_camera(ray, pi, at_first, attached=True)
-            if self.scatters(2):
-                si = dr.select(at_first, si, material_point(vertex.ray, vertex.pi, chosen, mi.RayFlags.All))
-        return ShadingPoint(si, vertex.depth, vertex.β, chosen)
+        vertex = _camera_vertex(ray, pi)
+        if not self.scatters(2):
+            si, no = seen_by_camera(ray, pi, pi.is_valid(), attached=True), mi.Bool(False)
+            still = Vicinity(mi.Float(0))
+            return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0)), None
+        depths = replace(self.depths, max_depth=self.depths.max_depth - beyond)
+        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode)
+        return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.slides, c.vicinity, c.density), c
 
     def scattered(self, ray, pi, depth, sampler, active) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`. Detached.
 
         ray, pi : the ray and what it meets. sampler : for the paths beyond. active : mi.Bool, (N,)
         """
-        beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, dr.full(mi.Spectrum, 1, dr.width(active)), mi.Float(1))
+        one = dr.full(mi.Spectrum, 1, dr.width(active))
+        beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), mi.Bool(False))
         return scattered_light(self.scene, sampler, beyond, self.depths, active)[0]
 
 
 def _camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
     one = dr.full(mi.UInt32, 1, dr.width(pi.t))
-    return Vertex(dr.detach(mi.Ray3f(ray)), pi, one, dr.full(mi.Spectrum, 1, dr.width(one)), mi.Float(1))
+    β = dr.full(mi.Spectrum, 1, dr.width(one))
+    return Vertex(dr.detach(mi.Ray3f(ray)), pi, one, β, mi.Float(1), dr.full(mi.Bool, False, dr.width(one)))

@@ -283,8 +283,6 @@ def test_limits_are_warned_about_once():
     for part in ("perfect mirrors", "jumps of the textures"):
         assert text.count(part) == 1
     assert "hard shadows" not in text
-    deep = {"type": "prb_edge", "max_depth": 3}
-    assert "lacks those in indirect light" in warnings_of(scene, "cube.vertex_positions", deep, direction=[1, 0, 0])
     quiet = warnings_of(scene, "cube.vertex_positions", {"sppi": 0}, direction=[1, 0, 0])
     assert "perfect mirrors" not in quiet
 

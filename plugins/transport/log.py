@@ -1,0 +1,82 @@
+"""The vertices of paths, written down, so that they can be visited again from either end."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .paths import Vertex
+from .scattering import Numbers
+
+
+class Log:
+    """A table of the vertices of paths: for each sample and each number along the path, at most 84 bytes.
+
+    width : number of samples.
+    like : mi.Ray3f, of the time and the wavelengths of the paths.
+    first, last : numbers of the vertices that it has room for.
+    """
+
+    def __init__(self, scene: mi.Scene, like: mi.Ray3f, first: int, last: int):
+        self.time, self.wavelengths = like.time, like.wavelengths
+        self.width, self.first, self.last = dr.width(like.o), first, last
+        width = self.width
+        n = width * max(last + 1 - first, 1)
+        floats = {"o": 3, "d": 3, "t": 1, "uv": 2, "light": 2, "lobe": 1, "direction": 2}
+        self._floats = {name: dr.empty(mi.Float, n * size) for name, size in floats.items()}
+        instances = any(s.class_name() == "Instance" for s in scene.shapes())
+        whole = ("prim", "shape", *(("shape_index", "instance") if instances else ()))
+        self._whole = {name: dr.empty(mi.UInt32, n) for name in whole}
+        self._β = dr.empty(mi.Float, n * dr.size_v(mi.Spectrum))
+
+    def _row(self, depth: mi.UInt32) -> mi.UInt32:
+        return (depth - self.first) * self.width + dr.arange(mi.UInt32, self.width)
+
+    def arrive(self, depth: mi.UInt32, ray, pi, mirrored: mi.Bool, active: mi.Bool) -> None:
+        """Note the ray to a vertex, and what it meets."""
+        row, active = self._row(depth), active & (depth <= self.last)
+        # The sign of the distance says whether a mirror shows it.
+        t = dr.select(mirrored, -pi.t, pi.t)
+        for name, value in {"o": ray.o, "d": ray.d, "t": t, "uv": pi.prim_uv}.items():
+            dr.scatter(self._floats[name], value, row, active, mode=dr.ReduceMode.NoConflicts)
+        whole = {"prim": pi.prim_index, "shape": pi.shape, "shape_index": pi.shape_index, "instance": pi.instance}
+        for name, target in self._whole.items():
+            value = whole[name]
+            value = value if isinstance(value, mi.UInt32) else dr.reinterpret_array(mi.UInt32, value)
+            dr.scatter(target, value, row, active, mode=dr.ReduceMode.NoConflicts)
+
+    def leave(self, depth: mi.UInt32, β: mi.Spectrum, numbers: Numbers, active: mi.Bool) -> None:
+        """Note the throughput to a vertex, and its random numbers."""
+        row, active = self._row(depth), active & (depth <= self.last)
+        dr.scatter(self._β, β, row, active, mode=dr.ReduceMode.NoConflicts)
+        for name in ("light", "lobe", "direction"):
+            dr.scatter(self._floats[name], getattr(numbers, name), row, active, mode=dr.ReduceMode.NoConflicts)
+
+    def close(self) -> None:
+        """All is written."""
+        dr.eval(self._floats, self._whole, self._β)
+
+    def vertex(self, depth: mi.UInt32, active: mi.Bool) -> Vertex:
+        """What was noted on arrival. Its β is 1."""
+        row = self._row(depth)
+        number = lambda kind, name: dr.gather(kind, self._floats[name], row, active)
+        whole = lambda name: dr.gather(mi.UInt32, self._whole[name], row, active)
+        t = number(mi.Float, "t")
+        ray = mi.Ray3f(number(mi.Point3f, "o"), number(mi.Vector3f, "d"), self.time, self.wavelengths)
+        pi = dr.zeros(mi.PreliminaryIntersection3f, self.width)
+        pi.t = dr.select(active, dr.abs(t), dr.inf)
+        pi.valid = dr.isfinite(pi.t)
+        pi.prim_uv, pi.prim_index = number(mi.Point2f, "uv"), whole("prim")
+        pi.shape = dr.reinterpret_array(mi.ShapePtr, whole("shape"))
+        if "instance" in self._whole:
+            pi.shape_index = whole("shape_index")
+            pi.instance = dr.reinterpret_array(mi.ShapePtr, whole("instance"))
+        return Vertex(ray, pi, depth, mi.Spectrum(1), mi.Float(1), t < 0)
+
+    def β(self, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        return dr.gather(mi.Spectrum, self._β, self._row(depth), active)
+
+    def numbers(self, depth: mi.UInt32, active: mi.Bool) -> Numbers:
+        row = self._row(depth)
+        kinds = {"light": mi.Point2f, "lobe": mi.Float, "direction": mi.Point2f}
+        return Numbers(*(dr.gather(kind, self._floats[name], row, active) for name, kind in kinds.items()))

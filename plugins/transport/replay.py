@@ -1,0 +1,346 @@
+"""The derivative of light along paths at fixed samples, and the motion of their vertices.
+
+Each vertex moves with the one before: close to it, it slides over its surface, since there the direction is held
+(`edge_sampling/parametrisation.py`). So a path is a chain. In forward mode, the motion is handed on from the first
+vertex to the last; in backward mode, gradients go from the last to the first. The path is written down for that, and
+visited again from its end (as path replay, Vicini et al. 2021, but with memory in proportion to the path's length).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
+
+from .log import Log
+from .paths import Depths, Vertex, choose_vertex, step
+from .scattering import Numbers, Scattering, next_vertex
+
+#: Longest path of which a table is made without counting its vertices before.
+LONG = 32
+
+
+@dataclass
+class Start:
+    """What moves the second vertex of a path. Attached.
+
+    o : mi.Point3f, the first vertex. d : mi.Vector3f, direction from there. weight : mi.Spectrum, throughput.
+    """
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    weight: mi.Spectrum
+
+
+class Chain:
+    """The vertices of paths behind the first, as they move.
+
+    vicinity : in which they slide.
+    """
+
+    def __init__(self, scene: mi.Scene, vicinity: Vicinity):
+        self.scattering = Scattering(scene, attached=True)
+        self.vicinity = vicinity
+
+    def surface(self, vertex: Vertex, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """The surface at a vertex, attached to the point and the direction from which its ray comes, too."""
+        with dr.resume_grad():
+            ray = mi.Ray3f(vertex.ray)
+            ray.o, ray.d = dr.replace_grad(ray.o, o), dr.replace_grad(ray.d, d)
+            far = self.vicinity.far(dr.square(vertex.pi.t))
+            si = sliding_point(ray, vertex.pi, dr.select(vertex.mirrored, 0, far), active)
+            if self.scattering.directional:
+                look_from(si, ray.o)
+            return si
+
+    def along(self, log: Log, depth: mi.UInt32, si: mi.SurfaceInteraction3f, vertex: Vertex, active) -> mi.Ray3f:
+        """The ray from a vertex to the next one that was written down, as it moves with the surface."""
+        beyond = log.vertex(depth + 1, active)
+        ray = mi.Ray3f(beyond.ray)
+        ray.o = mi.Point3f(si.p)
+        if self.scattering.any_mirror:
+            ray.d = self.turned(si, si.bsdf(vertex.ray), beyond, log.numbers(depth, active), active)
+        return ray
+
+    def turned(self, si, bsdf, beyond: Vertex, numbers: Numbers, active) -> mi.Vector3f:
+        """The direction to the vertex beyond, which turns with `si` if that is a mirror."""
+        active = active & beyond.mirrored
+        bs, _ = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, active)
+        return dr.select(active, dr.replace_grad(beyond.ray.d, si.to_world(bs.wo)), beyond.ray.d)
+
+
+def leaves(*values) -> list:
+    """Copies that depend on nothing, and carry gradients of their own."""
+    with dr.resume_grad():
+        values = [dr.detach(v) for v in values]
+        dr.enable_grad(values)
+        return values
+
+
+_FLAGS = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+
+
+def _derivatives(*values) -> list:
+    return [dr.detach(v) for v in dr.forward_to(list(values), flags=_FLAGS)]
+
+
+class Replay:
+    """Derivative of `scattered_light` at its fixed samples.
+
+    sampler : in the state in which `scattered_light` would find it.
+    vertex : the second of the path.
+    start : what moves that.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        vertex: Vertex,
+        start: Start,
+        vicinity: Vicinity,
+        depths: Depths,
+        active: mi.Bool,
+    ):
+        self.scene, self.sampler, self.vertex, self.start, self.depths = scene, sampler, vertex, start, depths
+        self.chain = Chain(scene, vicinity)
+        self.active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
+
+    def forward(self, start: Start) -> mi.Spectrum:
+        """Derivative of the light that arrives by way of the vertex, detached; given that of the start."""
+        scattering, depths = self.chain.scattering, self.depths
+
+        def bounce(total, o, d, β, vertex, active, sampler):
+            (x, direction) = leaves(vertex.ray.o, vertex.ray.d)
+            with dr.resume_grad():
+                dr.set_grad(x, o)
+                dr.set_grad(direction, d)
+            si = self.chain.surface(vertex, x, direction, active)
+            direct, onwards = scattering.scatter(
+                si, si.bsdf(vertex.ray), scattering.draw(sampler, active), active, self.chain.vicinity
+            )
+            with dr.resume_grad():
+                moving = onwards.moving
+                δdirect, δweight, o, d = _derivatives(direct, onwards.weight, moving.o, moving.d)
+            total += dr.select(active, vertex.β * δdirect + β * dr.detach(direct), 0)
+            weight = dr.detach(onwards.weight)
+            β = β * weight + vertex.β * δweight
+            after, active = step(vertex, onwards, sampler, depths, active)
+            # What Russian roulette divides by.
+            now = dr.max(vertex.β * weight)
+            β *= dr.select(now > 0, dr.max(after.β) / now, 0)
+            return total, o, d, β, after, active, sampler
+
+        zero = dr.zeros(mi.Spectrum, dr.width(self.active))
+        state = (zero, start.o, start.d, start.weight, self.vertex, self.active, self.sampler.clone())
+        return dr.while_loop(state, lambda t, o, d, β, v, active, s: active, bounce, label="path replay")[0]
+
+    def backward(self, δL: mi.Spectrum) -> Start:
+        """Propagate the gradient of a loss with respect to the light that arrives by way of the vertex to the
+        parameters; returns the gradient with respect to the start."""
+        log, last = written(self.scene, self.vertex.ray, 2, self.depths, self._follow)
+        chain, scattering = self.chain, self.chain.scattering
+        first = dr.detach(self.start.weight)
+
+        def bounce(depth, L, δo, δd):
+            active = self.active & (depth >= 2)
+            vertex, beyond = log.vertex(depth, active), log.vertex(depth + 1, active)
+            o, d = leaves(vertex.ray.o, vertex.ray.d)
+            si = chain.surface(vertex, o, d, active)
+            numbers, β = log.numbers(depth, active), log.β(depth, active)
+            direct, onwards = scattering.scatter(
+                si, si.bsdf(vertex.ray), numbers, active, chain.vicinity, dr.detach(beyond.pi)
+            )
+            with dr.resume_grad():
+                # What comes from farther on, relative to its value.
+                weight, moving = onwards.weight, onwards.moving
+                now = dr.detach(weight)
+                rest = dr.select(now != 0, L * weight / dr.select(now != 0, now, 1), 0)
+                value = dr.sum(δL * (β * direct + rest)) + dr.dot(δo, moving.o) + dr.dot(δd, moving.d)
+                dr.backward_from(dr.select(active, value, 0), flags=_FLAGS)
+                δo, δd = dr.select(active, dr.grad(o), δo), dr.select(active, dr.grad(d), δd)
+            L += dr.select(active, β * dr.detach(direct), 0)
+            return depth - 1, L, δo, δd
+
+        width = dr.width(self.active)
+        zero = mi.Vector3f(dr.zeros(mi.Float, width))
+        _, L, δo, δd = dr.while_loop(
+            (last, dr.zeros(mi.Spectrum, width), zero, mi.Vector3f(zero)),
+            lambda depth, *_: self.active & (depth >= 2),
+            bounce,
+            label="path replay",
+        )
+        # Of exactly these types: `dr.set_grad` passes over others, without a word.
+        weight = dr.select(first != 0, δL * L / dr.select(first != 0, first, 1), 0)
+        return Start(mi.Point3f(δo), mi.Vector3f(δd), mi.Spectrum(weight))
+
+    def _follow(self, log: Log | None) -> mi.UInt32:
+        """Write the paths down; returns the number of the last vertex of each that scatters, 0 if there is none."""
+        scattering, scene = self.chain.scattering, self.scene
+        if log is not None:
+            log.arrive(self.vertex.depth, self.vertex.ray, self.vertex.pi, self.vertex.mirrored, self.active)
+
+        def bounce(last, vertex, active, sampler):
+            si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
+            numbers = scattering.draw(sampler, active)
+            _, onwards = next_vertex(scene, si, si.bsdf(vertex.ray), numbers, active)
+            if log is not None:
+                log.leave(vertex.depth, vertex.β, numbers, active)
+                log.arrive(vertex.depth + 1, onwards.ray, onwards.pi, onwards.mirrored, active)
+            last = dr.select(active, vertex.depth, last)
+            vertex, active = step(vertex, onwards, sampler, self.depths, active)
+            return last, vertex, active, sampler
+
+        state = (dr.zeros(mi.UInt32, dr.width(self.active)), self.vertex, self.active, self.sampler.clone())
+        return dr.while_loop(state, lambda last, v, active, s: active, bounce, label="paths")[0]
+
+
+class ChosenVertex:
+    """One vertex of each path, as it moves. `p` and `n`, its position and the normal of its surface, carry gradients of
+    their own; in forward mode those of the chain, in backward mode `backward` hands them on.
+
+    ray : camera rays, attached to the camera.
+    pi : what they meet.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        first: Vertex,
+        depths: Depths,
+        mode: dr.ADMode,
+    ):
+        self.scene, self.first, self.vicinity = scene, first, Vicinity.of(first.pi)
+        self.chain = Chain(scene, self.vicinity)
+        found = []
+
+        def follow(log):
+            def note(vertex, numbers, onwards, active):
+                if log is not None:
+                    log.leave(vertex.depth, vertex.β, numbers, active)
+                    log.arrive(vertex.depth + 1, onwards.ray, onwards.pi, onwards.mirrored, active)
+
+            random = sampler if log is not None else sampler.clone()
+            found[:] = choose_vertex(scene, random, first, depths, self.vicinity, first.pi.is_valid(), note)
+            return found[0].depth
+
+        self.log, self.depth = written(scene, first.ray, 1, depths, follow)
+        self.vertex, self.active, self.slides, self.density = found
+        self._start(ray)
+        at_first = self.depth == 1
+        with dr.suspend_grad():
+            other = self.vertex.pi.compute_surface_interaction(self.vertex.ray, mi.RayFlags.All, self.active)
+            self.si = dr.select(at_first, dr.detach(self.at_first), other)
+        self.p, self.n = leaves(self.si.p, self.si.n)
+        with dr.resume_grad():
+            self.si.p, self.si.n = self.p, self.n
+            if mode == dr.ADMode.Forward:
+                p, n, o, d = _derivatives(self.at_first.p, self.at_first.n, self.start.o, self.start.d)
+                moved = self._forward(o, d)
+                dr.set_grad(self.p, dr.select(at_first, p, moved[0]))
+                dr.set_grad(self.n, dr.select(at_first, n, moved[1]))
+                self.at_first = self.start = None
+
+    def _start(self, ray: mi.Ray3f) -> None:
+        """The first vertex, and what moves the second."""
+        active = self.active
+        si = self.at_first = seen_by_camera(ray, self.first.pi, active, attached=True)
+        second = self.log.vertex(dr.full(mi.UInt32, 2, dr.width(self.depth)), active & (self.depth > 1))
+        d = second.ray.d
+        if self.chain.scattering.any_mirror:
+            with dr.resume_grad():
+                numbers = self.log.numbers(self.first.depth, active & (self.depth > 1))
+                d = self.chain.turned(si, si.bsdf(ray), second, numbers, active & (self.depth > 1))
+        with dr.resume_grad():
+            self.start = Start(mi.Point3f(si.p), d, mi.Spectrum(1))
+
+    def _forward(self, δo: mi.Point3f, δd: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Derivatives of position and normal, where it is not the first."""
+        chain, log = self.chain, self.log
+
+        def bounce(depth, p, n, o, d):
+            active = self.active & (depth <= self.depth)
+            vertex = log.vertex(depth, active)
+            x, direction = leaves(vertex.ray.o, vertex.ray.d)
+            with dr.resume_grad():
+                dr.set_grad(x, o)
+                dr.set_grad(direction, d)
+            si = chain.surface(vertex, x, direction, active)
+            with dr.resume_grad():
+                moving = chain.along(log, depth, si, vertex, active & (depth < self.depth))
+                found = _derivatives(si.p, si.n, moving.o, moving.d)
+            return depth + 1, *(mi.Vector3f(v) for v in found)
+
+        zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
+        state = (dr.full(mi.UInt32, 2, dr.width(self.depth)), mi.Vector3f(zero), mi.Vector3f(zero))
+        return dr.while_loop(
+            (*state, mi.Vector3f(δo), mi.Vector3f(δd)),
+            lambda depth, *_: self.active & (depth <= self.depth),
+            bounce,
+            label="motion of a vertex",
+        )[1:3]
+
+    def backward(self) -> None:
+        """Hand the gradients on to the surfaces, and to the camera rays."""
+        chain, log = self.chain, self.log
+        δp, δn = dr.grad(self.p), dr.grad(self.n)
+        dr.eval(δp, δn)
+
+        def bounce(depth, δp, δn, δd):
+            active = self.active & (depth >= 2)
+            vertex = log.vertex(depth, active)
+            o, d = leaves(vertex.ray.o, vertex.ray.d)
+            si = chain.surface(vertex, o, d, active)
+            with dr.resume_grad():
+                moving = chain.along(log, depth, si, vertex, active & (depth < self.depth))
+                value = dr.dot(δp, moving.o) + dr.dot(δn, si.n) + dr.dot(δd, moving.d)
+                dr.backward_from(dr.select(active, value, 0), flags=_FLAGS)
+                δo, δd = dr.grad(o), dr.grad(d)
+            return depth - 1, mi.Vector3f(δo), mi.Vector3f(0), δd
+
+        with dr.suspend_grad():
+            at_first = self.depth == 1
+            later = lambda g: dr.select(at_first, 0, mi.Vector3f(g))
+            zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
+            _, δo, _, δd = dr.while_loop(
+                (mi.UInt32(self.depth), later(δp), later(δn), zero),
+                lambda depth, *_: self.active & (depth >= 2),
+                bounce,
+                label="motion of a vertex",
+            )
+        with dr.resume_grad():
+            si, start = self.at_first, self.start
+            value = dr.dot(dr.select(at_first, δp, 0), si.p) + dr.dot(dr.select(at_first, δn, 0), si.n)
+            value += dr.select(self.active & ~at_first, dr.dot(δo, start.o) + dr.dot(δd, start.d), 0)
+            dr.backward_from(value, flags=_FLAGS)
+
+
+def written(
+    scene: mi.Scene, like: mi.Ray3f, first: int, depths: Depths, follow: Callable[[Log | None], mi.UInt32]
+) -> tuple[Log, mi.UInt32]:
+    """Paths, written down from their vertex number `first` on; and what `follow` returns, which goes along them.
+
+    like : see `Log`.
+
+    Raises
+    ------
+    RuntimeError : paths have no limit, while `dr.freeze` records.
+    """
+    last = depths.max_depth
+    if last > LONG:
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise RuntimeError(
+                f'a frozen function cannot count the vertices of paths: set "max_depth" to at most {LONG}'
+            )
+        last = 2 + int(dr.max(follow(None))[0])
+    log = Log(scene, like, first, last)
+    reached = follow(log)
+    dr.eval(reached)
+    log.close()
+    return log, reached
