@@ -63,6 +63,12 @@ def free_memory() -> Iterator[None]:
         dr.flush_malloc_cache()
 
 
+@pytest.fixture
+def no_derivative_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits do not render one at their end: it takes a second or two to compile, and many tests do not look at it."""
+    monkeypatch.setattr("rimlight.inverse.renderer.Renderer.derivative", lambda *_: None)
+
+
 @pytest.fixture(scope="session")
 def shared() -> Callable[[str], Path]:
     """Path of a file in the shared data, which are not part of the repository. Skips the test when it is missing."""
