@@ -225,8 +225,7 @@ PANEL = {"key": "panel.to_world", "direction": [1, 0, 0]}
 RADIANCE = {"key": "panel.emitter.radiance.value", "direction": [1]}
 SMALL = {"side": SIDE, "camera": CAMERA, "normals": NORMALS, "colour": COLOUR, "place": PLACE, "turn": TURN}
 
-#: Lights, whether the floor is rough, and filters: two lights or all kinds, each filter, each floor. Compiling takes 15 s
-#: of each.
+#: Lights, whether the floor is rough, and filters: each of them, not each with each other, since compiling takes 15 s.
 LIT = [(small_lights, False, "gaussian"), (small_lights, True, "box"), (all_kinds, True, "gaussian")]
 if "RIMLIGHT_FULL" in os.environ:
     LIT += [(small_lights, False, "box"), (small_lights, True, "gaussian"), (all_kinds, True, "box")]
