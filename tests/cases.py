@@ -45,7 +45,7 @@ class Case:
     scene : makes the scene.
     motion : arguments of `Motion`.
     step : of the finite differences, in units of θ: a few hundredths of a pixel.
-    spp, seeds : of the derivative.
+    spp, seeds : of the derivative. Where `spp` is 0, `integrator` has the samples of each term: many of the noisy ones.
     runs : of the finite differences.
     integrator : which one is tested, as a dictionary.
     reference_spp : samples per pixel of each image of the finite differences; a square number.
@@ -121,8 +121,8 @@ def messages() -> Iterator[list[str]]:
 # ---------------------- Building blocks ----------------------
 
 
-def prb_edge(max_depth: int) -> dict:
-    return {"type": "prb_edge", "max_depth": max_depth}
+def prb_edge(max_depth: int, **samples: int) -> dict:
+    return {"type": "prb_edge", "max_depth": max_depth, **samples}
 
 
 def smooth_cube() -> dict:
@@ -671,6 +671,8 @@ def crop(rfilter: str = "box") -> Callable[[], mi.Scene]:
     return cube(lambda: camera(film={**film(rfilter), **CROP}))
 
 
+MIRRORED = prb_edge(3, sppc=256, sppp=32, sppi=32)
+
 CASES = [
     Case("two_triangles_green", two_triangles, vertex("green", 1), 4e-3, runs=48),
     Case("two_triangles_red", two_triangles, vertex("red", 1), 4e-3, runs=48),
@@ -738,22 +740,46 @@ CASES = [
     Case("shadow_batch", shadow_blocker(batch), BLOCKER_UP, 2.5e-2),
     Case("shadow_batch_camera", shadow_blocker(batch), LEFT_CAMERA, 1e-2),
     Case("glossy_receiver", glossy_receiver(0.01), BLOCKER_SIDE, 8e-3, spp=256, runs=40),
-    Case("mirror_receiver", glossy_receiver(5e-4), BLOCKER_SIDE, 5e-3, spp=1024, runs=24),
+    Case(
+        "mirror_receiver",
+        glossy_receiver(5e-4),
+        BLOCKER_SIDE,
+        5e-3,
+        spp=0,
+        runs=24,
+        integrator={"type": "direct_edge", "sppc": 32, "sppp": 32, "sppi": 1024},
+    ),
     # Zero, but for the floor's outline.
     Case("near_light", near_light, FLOOR_SIDE, 4e-3, runs=24),
     # These two must agree with each other, too.
-    Case("mirrored_sphere", mirrored_sphere(False), SPHERE_SIDE, 4e-2, spp=256, runs=64, integrator=prb_edge(3)),
-    Case("mirrored_sphere_seam", mirrored_sphere(True), SPHERE_SIDE, 4e-2, spp=256, runs=64, integrator=prb_edge(3)),
-    Case("cornell_box", cornell_box, BOX_SIDE, 1.5e-2, spp=128, runs=15, integrator=prb_edge(5)),
-    Case("cornell_box_camera", cornell_box, ORBIT, 8e-3, spp=256, runs=15, integrator=prb_edge(5)),
+    Case("mirrored_sphere", mirrored_sphere(False), SPHERE_SIDE, 4e-2, spp=0, runs=64, integrator=MIRRORED),
+    Case("mirrored_sphere_seam", mirrored_sphere(True), SPHERE_SIDE, 4e-2, spp=0, runs=64, integrator=MIRRORED),
+    Case(
+        "cornell_box",
+        cornell_box,
+        BOX_SIDE,
+        1.5e-2,
+        spp=0,
+        runs=15,
+        integrator=prb_edge(5, sppc=128, sppp=32, sppi=128),
+    ),
+    Case(
+        "cornell_box_camera",
+        cornell_box,
+        ORBIT,
+        8e-3,
+        spp=0,
+        runs=15,
+        integrator=prb_edge(5, sppc=256, sppp=32, sppi=32),
+    ),
     Case(
         "bunny_box",
         bunny_box,
         BUNNY_SIDE,
         1e-2,
-        spp=64,
+        spp=0,
         runs=36,
-        integrator=prb_edge(7),
+        integrator=prb_edge(7, sppc=16, sppp=64, sppi=16),
         reference_spp=4096,
         needs=REDNER,
     ),
@@ -829,7 +855,15 @@ CASES = [
         reference_spp=4096,
     ),
     # Geometry that moves at indirect bounces: only there, and in the frame as well.
-    Case("out_of_frame", out_of_frame, SIDE, 0.12, spp=1024, runs=100, integrator=prb_edge(3)),
+    Case(
+        "out_of_frame",
+        out_of_frame,
+        SIDE,
+        0.12,
+        spp=0,
+        runs=100,
+        integrator=prb_edge(3, sppc=1024, sppp=32, sppi=64),
+    ),
     Case("open_air", open_air, SIDE, 1e-2, spp=128, runs=96, integrator=prb_edge(3)),
     Case("sky_blocker", sky_blocker, BLOCKER_SIDE, 5e-2, spp=256, runs=48),
     *(Case(k, *of, spp=128, runs=12, integrator=prb_edge(4), reference_spp=4096) for k, of in ROOMS.items()),

@@ -43,12 +43,30 @@ def variant() -> Iterator[str]:
     yield "llvm_ad_rgb"
 
 
+#: Kernels that had been launched when memory was last freed.
+launched = 0
+
+
 @pytest.fixture(autouse=True)
 def free_memory() -> Iterator[None]:
-    """Free what a test left behind. Kernels stay: compiling them again is most of a short test's time."""
+    """Free what a test left behind. Kernels stay: compiling them again is most of a short test's time.
+
+    Not after a test that launched no kernel: it left no scene that was used, and a collection takes 0.07 s, which is
+    more than most of these tests.
+    """
+    global launched
     yield
-    gc.collect()
-    dr.flush_malloc_cache()
+    launches, _, _ = dr.detail.launch_stats()
+    if launches != launched:
+        launched = launches
+        gc.collect()
+        dr.flush_malloc_cache()
+
+
+@pytest.fixture
+def no_derivative_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits do not render one at their end: it takes a second or two to compile, and many tests do not look at it."""
+    monkeypatch.setattr("rimlight.inverse.renderer.Renderer.derivative", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

@@ -55,9 +55,9 @@ def stopping_after(steps: int):
 
 # ------------------------------------------------------------------ checkpoints
 
-#: Arguments: folder, and what happens: "nothing", it resumes ("resume"), or it kills itself in the step of a number,
-#: between checkpoints ("between") or while it writes one ("writing"). Each in a process of its own: a second scene in
-#: the same process adds up in another order.
+#: Arguments: folder, "start" or "resume", and how it ends: "whole", or it kills itself in the step of a number, between
+#: checkpoints ("between") or while it writes one ("writing"). It says in which step it began. Each in a process of its
+#: own: a second scene in the same process adds up in another order.
 SCRIPT = """
 import os, signal, sys
 from rimlight import inverse
@@ -69,36 +69,31 @@ from rimlight.inverse import checkpoint, fitting, problem
 dr.set_thread_count(1)
 fitting.INTERVAL = 0
 
-def fit(folder, resume, last, when):
-    run = fitting.Run(problem.read("fit.toml"), out=folder, resume=resume)
-    steps = [run.progress.step]
+folder, start, end, last = sys.argv[1:]
+run = fitting.Run(problem.read("fit.toml"), out=folder, resume=start == "resume")
+print(run.progress.step, flush=True)
 
-    def executor(values, tasks):
-        steps.append(run.progress.step)
-        if run.progress.step == last:
-            if when == "between":
-                os.kill(os.getpid(), signal.SIGKILL)
-            if when == "writing":
-                exr.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-        if when == "between" and run.progress.step == last - 3:
-            fitting.INTERVAL = 1000
-        return [run.renderer.gradient(values, task) for task in tasks]
+def executor(values, tasks):
+    if run.progress.step == int(last):
+        if end == "between":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if end == "writing":
+            exr.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    if end == "between" and run.progress.step == int(last) - 3:
+        fitting.INTERVAL = 1000
+    return [run.renderer.gradient(values, task) for task in tasks]
 
-    run.executor = executor
-    found = run.finish(progress=False)
-    errors = {label.replace("/", " "): e for label, e in found.errors.items()}
-    frames = np.array([step for step, _ in found.frames])
-    np.savez(folder + ".npz", losses=found.losses, segments=found.segments, frames=frames, began=steps[0],
-             **found.values, **errors)
-
-folder, what, step = sys.argv[1:]
-fit(folder, resume=what == "resume", last=int(step), when=what)
+run.executor = executor
+found = run.finish(progress=False)
+errors = {label.replace("/", " "): e for label, e in found.errors.items()}
+frames = np.array([step for step, _ in found.frames])
+np.savez(folder + ".npz", losses=found.losses, segments=found.segments, frames=frames, **found.values, **errors)
 """
 
 
 @pytest.mark.slow
 def test_killed_fits_resume_bit_by_bit(tmp_path):
-    """Among several starts, in a later stage, and while a checkpoint is written."""
+    """A fit that is killed among several starts, while a checkpoint is written, and in a later stage."""
     pose = Free(key=(RED,), kind="pose", move="xy", turn="z", start=(0.1, 0, 0, 0, 0, 20), rate=0.05)
     posed = triangles(
         *(SHAPE, MATERIAL, pose),
@@ -110,28 +105,26 @@ def test_killed_fits_resume_bit_by_bit(tmp_path):
     problems.write(tmp_path / "fit.toml", posed)
     (tmp_path / "run.py").write_text(SCRIPT)
 
-    def run(*arguments: str | int) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-W", "error", "run.py", *map(str, arguments)]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+    def run(folder: str, start: str, end: str = "whole", last: int = -1) -> int:
+        """The step in which it began."""
+        command = [sys.executable, "-W", "error", "run.py", folder, start, end, str(last)]
+        process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+        assert process.returncode == (0 if end == "whole" else -signal.SIGKILL), process.stderr
+        return int(process.stdout)
 
-    process = run("whole", "nothing", -1)
-    assert process.returncode == 0, process.stderr
-    deaths = {"exploring": (17, "between"), "later": (43, "between"), "writing": (37, "writing")}
-    for folder, (step, what) in deaths.items():
-        process = run(folder, what, step)
-        assert process.returncode == -signal.SIGKILL, process.stderr
-        _, facts = checkpoint.load(tmp_path / folder / "checkpoint.npz")
-        assert facts["step"] == (step if what == "writing" else step - 3)
-        process = run(folder, "resume", -1)
-        assert process.returncode == 0, process.stderr
-    with np.load(tmp_path / "whole.npz") as file:
-        whole = dict(file)
-    assert len(whole["losses"]) == 50 and whole["losses"][-1] < whole["losses"][0]
-    for folder, (step, what) in deaths.items():
-        with np.load(tmp_path / f"{folder}.npz") as resumed:
-            assert resumed["began"] == (step if what == "writing" else step - 3)
-            for name in whole.keys() - {"began"}:
-                np.testing.assert_array_equal(resumed[name], whole[name], err_msg=f"{folder}, {name}")
+    assert run("whole", "start") == 0
+    start, left = "start", 0
+    for end, last in (("between", 17), ("writing", 37), ("between", 43)):
+        assert run("killed", start, end, last) == left
+        start, left = "resume", last if end == "writing" else last - 3
+        _, facts = checkpoint.load(tmp_path / "killed" / "checkpoint.npz")
+        assert facts["step"] == left
+    assert run("killed", "resume") == left
+    with np.load(tmp_path / "whole.npz") as whole, np.load(tmp_path / "killed.npz") as killed:
+        assert len(whole["losses"]) == 50 and whole["losses"][-1] < whole["losses"][0]
+        assert whole.keys() == killed.keys()
+        for name in whole:
+            np.testing.assert_array_equal(killed[name], whole[name], err_msg=name)
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,8 @@ from rimlight.inverse import fitting
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
 from rimlight.inverse.renderer import Gradient
 
+pytestmark = pytest.mark.usefixtures("no_derivative_image")
+
 GREEN, RED, COLOUR = "green.vertex_positions", "red.vertex_positions", "green.bsdf.reflectance.value"
 SHAPE = Free(key=(GREEN,), kind="shape", move="xy", rate=0.05, start=(0.2, -0.1, 0))
 MATERIAL = Free(key=(COLOUR,), kind="material", rate=0.02)

@@ -25,6 +25,7 @@ LEFT = {
 }
 
 
+@pytest.mark.usefixtures("no_derivative_image")
 @pytest.mark.parametrize("name", LEFT)
 def test_small_fit_converges(name):
     iterations, most_left, most_picture = LEFT[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 import cases
@@ -224,9 +225,13 @@ PANEL = {"key": "panel.to_world", "direction": [1, 0, 0]}
 RADIANCE = {"key": "panel.emitter.radiance.value", "direction": [1]}
 SMALL = {"side": SIDE, "camera": CAMERA, "normals": NORMALS, "colour": COLOUR, "place": PLACE, "turn": TURN}
 
+#: Lights, whether the floor is rough, and filters: each of them, not each with each other, since compiling takes 15 s.
+LIT = [(small_lights, False, "gaussian"), (small_lights, True, "box"), (all_kinds, True, "gaussian")]
+if "RIMLIGHT_FULL" in os.environ:
+    LIT += [(small_lights, False, "box"), (small_lights, True, "gaussian"), (all_kinds, True, "box")]
 
-@pytest.mark.parametrize("film", ["box", "gaussian"])
-@pytest.mark.parametrize(("lights", "rough"), [(small_lights, False), (small_lights, True), (all_kinds, True)])
+
+@pytest.mark.parametrize(("lights", "rough", "film"), LIT)
 def test_forward_and_backward_agree(lights, rough, film):
     scene, integrator = room(lights(), rough, FILMS[film]()), rig(max_depth=4, rr_depth=2)
     motions = [*SMALL.values(), INTENSITY] if lights is small_lights else [SIDE, CAMERA, COLOUR, PLACE, PANEL, RADIANCE]

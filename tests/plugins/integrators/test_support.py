@@ -42,6 +42,9 @@ COLUMNS = {"moves": "moves", "changes": "changes", "is passed": "passed", "sees 
 #: Error that the step of the finite differences may make: it is long, so that few samples suffice.
 STEP = 0.01
 
+#: Samples per pixel of each term of a chart. Where plates pass, the interior has no noise, the film boundary little.
+CHART_SAMPLES = {"passed": {"sppc": 16, "sppp": 64, "sppi": 128}}
+
 #: The largest noise of a cell of a chart, relative to its L1 norm; and of lights, where it is more than usual.
 CHART_NOISE = 0.15
 NOISY = {("`sunsky` without its sun", "moves"): 0.3}
@@ -51,9 +54,9 @@ def reference(name: str, of: Sequence[str], scene: mi.Scene, motion: Any, **opti
     return cases.stored_differences(f"support_{name}", of, scene, motion, runs=6, **options)
 
 
-def runs_of(scene: mi.Scene, motion: Any, runs: int, spp: int) -> np.ndarray:
-    """Derivatives with several seeds: (runs, H, W, C)."""
-    integrator = mi.load_dict({"type": "direct_edge"})
+def runs_of(scene: mi.Scene, motion: Any, runs: int, spp: int = 0, **samples: int) -> np.ndarray:
+    """Derivatives with several seeds: (runs, H, W, C). samples : per pixel, of each term, where `spp` is 0."""
+    integrator = mi.load_dict({"type": "direct_edge", **samples})
     images = [derivative_image(scene, integrator, motion, spp=spp, seed=100 + i) for i in range(runs)]
     return np.array(images, np.float64)
 
@@ -351,7 +354,7 @@ class Chart:
 
     def _measure(self, scene: mi.Scene, motion: Together):
         expected = reference(f"chart_{self.column}", self.names, scene, motion, step=1e-2, spp=1024)
-        return runs_of(scene, motion, runs=16, spp=128), expected
+        return runs_of(scene, motion, runs=16, **CHART_SAMPLES.get(self.column, {"spp": 128})), expected
 
     def compare(self, name: str) -> Agreement:
         """In the cell of a row."""
