@@ -102,8 +102,9 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             "its cutoff_angle, and a projector an image with a black border."
         )
     if any(is_mirror(s) for s in scene.shapes()):
+        lacks = "outlines in what" if from_points or not depths.scatters(2) else "what"
         limits.append(
-            "the derivative lacks the motion of what perfect mirrors and glass show; "
+            f"the derivative lacks the motion of {lacks} perfect mirrors and glass show; "
             'give them a roughness, or set "sppi" to 0 to accept this.'
         )
     through = names(s for s in scene.shapes() if lets_through(s))
