@@ -47,8 +47,8 @@ def test_what_a_mirror_shows_slides():
 
 
 def test_what_moves_past_an_edge_that_stands_still():
-    """A floor is lit by a wall, past the edge of a screen. Only the wall moves, along itself: its own edges are far away,
-    and its colour changes along it."""
+    """A floor is lit by a wall, past the edge of a screen. Only the wall moves, along itself: its own edges are far
+    away, and its colour changes along it."""
     colours = mi.Bitmap(np.array([[[0.1] * 3, [0.9] * 3, [0.1] * 3, [0.9] * 3]], np.float32))
     picture = {"type": "bitmap", "bitmap": colours, "raw": True, "filter_type": "bilinear"}
     wall = {
