@@ -44,7 +44,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
 
     **Limits.** Only triangle meshes, spheres, disks and cylinders can move: a moving hair, instance, ... is
     refused, and so is a camera that moves past one. Missing, with a warning: the motion of outlines in what perfect
-    mirrors and glass show, the jumps of textures (``checkerboard``, ``nearest`` filters) and of slopes of bump maps, the
+    mirrors and glass show, the jumps of textures (``checkerboard``, ``nearest`` filters) and of bump maps, the
     lines in which meshes cut through each other, or the far clipping plane through them, the borders of hard beams,
     and shadows of hair, instances, ... on what moves. Warned about, too: jumps at T-junctions, which count twice,
     and participating media, which are taken for empty (derivatives with respect to their parameters are refused).

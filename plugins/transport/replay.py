@@ -223,7 +223,8 @@ class ChosenVertex:
         def follow(log):
             def note(vertex, numbers, onwards, active):
                 if log is not None:
-                    log.leave(vertex.depth, vertex.β, numbers, active)
+                    if self.chain.scattering.any_mirror:
+                        log.leave(vertex.depth, vertex.β, numbers, active)
                     log.arrive(vertex.depth + 1, onwards.ray, onwards.pi, onwards.mirrored, active)
 
             random = sampler if log is not None else sampler.clone()
@@ -231,7 +232,7 @@ class ChosenVertex:
             return found[0].depth
 
         self.log, self.depth = written(scene, first.ray, 1, depths, follow)
-        self.vertex, self.active, self.slides, self.density = found
+        self.vertex, self.active, self.since, self.density = found
         self._start(ray)
         at_first = self.depth == 1
         with dr.suspend_grad():
@@ -278,9 +279,16 @@ class ChosenVertex:
             return depth + 1, *(mi.Vector3f(v) for v in found)
 
         zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
-        state = (dr.full(mi.UInt32, 2, dr.width(self.depth)), mi.Vector3f(zero), mi.Vector3f(zero))
+        # A vertex that does not slide knows nothing of those before.
+        first, chained = dr.maximum(self.since, 2), self.since == 1
         return dr.while_loop(
-            (*state, mi.Vector3f(δo), mi.Vector3f(δd)),
+            (
+                first,
+                mi.Vector3f(zero),
+                mi.Vector3f(zero),
+                dr.select(chained, mi.Vector3f(δo), 0),
+                dr.select(chained, mi.Vector3f(δd), 0),
+            ),
             lambda depth, *_: self.active & (depth <= self.depth),
             bounce,
             label="motion of a vertex",
@@ -293,7 +301,7 @@ class ChosenVertex:
         dr.eval(δp, δn)
 
         def bounce(depth, δp, δn, δd):
-            active = self.active & (depth >= 2)
+            active = self.active & (depth >= dr.maximum(self.since, 2))
             vertex = log.vertex(depth, active)
             o, d = leaves(vertex.ray.o, vertex.ray.d)
             si = chain.surface(vertex, o, d, active)
@@ -310,14 +318,16 @@ class ChosenVertex:
             zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
             _, δo, _, δd = dr.while_loop(
                 (mi.UInt32(self.depth), later(δp), later(δn), zero),
-                lambda depth, *_: self.active & (depth >= 2),
+                lambda depth, *_: self.active & (depth >= dr.maximum(self.since, 2)),
                 bounce,
                 label="motion of a vertex",
             )
         with dr.resume_grad():
             si, start = self.at_first, self.start
             value = dr.dot(dr.select(at_first, δp, 0), si.p) + dr.dot(dr.select(at_first, δn, 0), si.n)
-            value += dr.select(self.active & ~at_first, dr.dot(δo, start.o) + dr.dot(δd, start.d), 0)
+            value += dr.select(
+                self.active & ~at_first & (self.since == 1), dr.dot(δo, start.o) + dr.dot(δd, start.d), 0
+            )
             dr.backward_from(value, flags=_FLAGS)
 
 

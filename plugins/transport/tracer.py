@@ -135,7 +135,7 @@ class PathTracer:
             return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0)), None
         depths = replace(self.depths, max_depth=self.depths.max_depth - beyond)
         c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode)
-        return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.slides, c.vicinity, c.density), c
+        return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.since < c.depth, c.vicinity, c.density), c
 
     def scattered(self, ray, pi, depth, sampler, active) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`. Detached.
