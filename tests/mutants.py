@@ -184,6 +184,25 @@ MUTANTS = [
         "return height <= FLUSH * dr.epsilon(mi.Float) * scale",
         "return height < 0",
     ),
+    # ---------------------- What random scenes have found ----------------------
+    mutant(
+        "film boundary: what is not visible has a place on the film",
+        FILM,
+        "p = dr.select(found.valid, outlines.point(at, chosen, found), eye)",
+        "p = outlines.point(at, chosen, found)",
+    ),
+    mutant(
+        "film boundary: looks as near beside glass as beside other meshes",
+        FILM,
+        "in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind, 0)",
+        "pass",
+    ),
+    mutant(
+        "edges from points: seen from the surface, not from where rays start",
+        SHADING,
+        "lift = si.spawn_ray(towards).o - si.p",
+        "lift = 0 * towards",
+    ),
 ]
 
 

@@ -41,6 +41,9 @@ LOST = (
 #: Rounding, relative to the L1 norm.
 ROUNDING = 1e-4
 
+#: The same where all moves. Finer, since what edges do to light from lamps and walls is little beside a camera's turn.
+NOTHING = 3e-5
+
 
 def vectors(size: float, **fixed: float) -> st.SearchStrategy:
     """Three numbers of two digits, each at most `size`, but for those that are given: x, y, or z."""
@@ -151,7 +154,7 @@ def test_nothing_changes_if_all_moves(integrator, numbers):
     world = ["floor", "cube", "ball", "lamp", *bulb]
     all_turns = subject.turning(numbers.axis, numbers.pivot, "sensor", *world)
     scale = noise(subject.images(all_turns[:1], [0], 16))
-    assert noise(subject.images(all_turns, [0], 16)) < ROUNDING * scale
+    assert noise(subject.images(all_turns, [0], 16)) < NOTHING * scale
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -161,7 +164,7 @@ def test_nothing_changes_if_all_grows(integrator, numbers):
     """With a camera that moves away as much: lamps as bright as before, whose areas grow."""
     subject = Subject(numbers, integrator, glossy=True, sky=False, bulb=False)
     lamp = noise(subject.grown(["lamp"], numbers.pivot, 0, 16))
-    assert noise(subject.grown(["floor", "cube", "ball", "lamp"], numbers.pivot, 0, 16)) < ROUNDING * lamp
+    assert noise(subject.grown(["floor", "cube", "ball", "lamp"], numbers.pivot, 0, 16)) < NOTHING * lamp
 
 
 @pytest.mark.xfail(strict=False, reason=LOST)
