@@ -6,6 +6,7 @@ noticed: the standard error of the difference is known, and the test fails if it
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
 
 import drjit as dr
@@ -30,7 +31,7 @@ FEW = settings(
 
 #: Samples per pixel and images where noise is compared, and the largest standard error of a factor with which the
 #: comparison notices 2 % (it fails beyond 5.2 of them, with 16 images).
-SPP, RUNS, ERROR = 192, 16, 0.0028
+SPP, RUNS, ERROR = 256, 16, 0.003
 
 #: A fault that is known, but not understood.
 LOST = (
@@ -90,9 +91,9 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("integrator", "change"), [*(("direct_edge", change) for change in CHANGES), ("prb_edge", "moved and scaled")]
-)
+# In `make test-full`, `prb_edge` as well.
+@pytest.mark.parametrize("integrator", INTEGRATORS if "RIMLIGHT_FULL" in os.environ else INTEGRATORS[:1])
+@pytest.mark.parametrize("change", CHANGES)
 @given(numbers=NUMBERS, place=PLACES)
 @FEW
 def test_the_derivative_stays(integrator, change, numbers, place):
@@ -168,7 +169,7 @@ def test_nothing_changes_if_all_grows(integrator, numbers):
 
 
 @pytest.mark.xfail(strict=False, reason=LOST)
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["direct_edge"])  # compiling `prb_edge` backward alone would take half a minute
 @given(numbers=NUMBERS)
 @FEW
 def test_forward_is_backward(integrator, numbers):
