@@ -81,6 +81,10 @@ class Case:
         images = [derivative_image(scene, integrator, motion, spp=spp, seed=i) for i in range(self.seeds)]
         return np.array(images, np.float64)
 
+    def image(self) -> np.ndarray:
+        """What is differentiated: (H, W, C)."""
+        return np.array(mi.render(self.scene(), integrator=mi.load_dict(self.integrator), spp=256))
+
 
 def stored_differences(
     name: str, of: Sequence[str], scene: mi.Scene, motion: Any, runs: int, **options: Any

@@ -10,6 +10,8 @@ import gc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import gallery
+import pages
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -34,6 +36,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         module = item.path.stem
         if module in modules or (module == "test_derivatives" and item.callspec.params["case"].name in cases):
             item.add_marker(pytest.mark.fast)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if gallery.wanted() and not hasattr(config, "workerinput"):
+        gallery.clear()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say what a row of dots does not: which tests could not run here, and where the pictures are."""
+    skipped = [r for r in terminalreporter.stats.get("skipped", []) if pages.NO_BROWSER in str(r.longrepr)]
+    if skipped:
+        terminalreporter.write_line(
+            f"NOT RUN: {len(skipped)} tests of pages in a browser, since there is no Chromium or relative of it here.",
+            yellow=True,
+        )
+    if gallery.wanted() and (path := gallery.write()):
+        terminalreporter.write_line(f"All derivatives beside their references, the worst first: {path}")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,8 +1,8 @@
 """Deliberate faults, one at a time, and which tests notice each:  python tests/mutants.py [--only NUMBER ...] [TEST]
 
 A test that cannot fail proves nothing. Each fault is made in a copy of the project, never in the project itself. The
-fast tests run first, and the others only if none of these fails. They stop at the third that fails; what no test
-notices is listed at the end, with exit code 1.
+fast tests run first, and the others only if none of these fails. They stop at the third that fails, or at another
+(`--stop-at`); what no test notices is listed at the end, with exit code 1.
 """
 
 from __future__ import annotations
@@ -22,7 +22,16 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Where `rimlight` and its parts come from.
 PACKAGES = {"plugins": "", "edge_sampling": "edge_sampling", "inverse": "inverse", "scenes": "scenes"}
 
-TESTS = ("derivatives", "coarse_meshes", "fine_meshes", "stale", "direct_edge", "prb_edge", "random_scenes")
+TESTS = (
+    "derivatives",
+    "invariants",
+    "coarse_meshes",
+    "fine_meshes",
+    "stale",
+    "direct_edge",
+    "prb_edge",
+    "random_scenes",
+)
 FOLDER = "tests/plugins/integrators"
 
 
@@ -175,6 +184,25 @@ MUTANTS = [
         "return height <= FLUSH * dr.epsilon(mi.Float) * scale",
         "return height < 0",
     ),
+    # ---------------------- What random scenes have found ----------------------
+    mutant(
+        "film boundary: what is not visible has a place on the film",
+        FILM,
+        "p = dr.select(found.valid, outlines.point(at, chosen, found), eye)",
+        "p = outlines.point(at, chosen, found)",
+    ),
+    mutant(
+        "film boundary: looks as near beside glass as beside other meshes",
+        FILM,
+        "in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind, 0)",
+        "pass",
+    ),
+    mutant(
+        "edges from points: seen from the surface, not from where rays start",
+        SHADING,
+        "lift = si.spawn_ray(towards).o - si.p",
+        "lift = 0 * towards",
+    ),
 ]
 
 
@@ -205,7 +233,7 @@ def changed(m: Mutant, text: str) -> str:
     return text
 
 
-def failures(m: Mutant, tests: list[str]) -> list[str]:
+def failures(m: Mutant, tests: list[str], stop_at: int = 3) -> list[str]:
     """Names of the first tests that fail with it: of the fast ones, or if none of these does, of all."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -215,10 +243,10 @@ def failures(m: Mutant, tests: list[str]) -> list[str]:
         # Found before the project that is installed.
         environment = {**os.environ, "PYTHONPATH": str(folder)}
         for which in (["-m", "fast"], []):
-            options = ["-q", "-n", "2", "--maxfail", "3", "-p", "no:cacheprovider", *which]
+            options = ["-q", "-n", "2", "--maxfail", str(stop_at), "-p", "no:cacheprovider", *which]
             command = [sys.executable, "-m", "pytest", *options, *tests]
             run = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-            if run.returncode not in (0, 1, 2):
+            if run.returncode not in (0, 1, 2, 5):  # 5: none of them is fast
                 raise SystemExit(f"{m.fault}: the tests did not run\n{run.stdout[-2000:]}{run.stderr[-2000:]}")
             found = re.findall(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.M)
             if found:
@@ -230,6 +258,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tests", nargs="*", default=[f"{FOLDER}/test_{name}.py" for name in TESTS], metavar="TEST")
     parser.add_argument("--only", type=int, nargs="*", metavar="NUMBER", help="these faults, counted from 0")
+    parser.add_argument("--stop-at", type=int, default=3, metavar="COUNT", help="tests that have failed")
     parser.add_argument("--list", action="store_true", help="the faults")
     options = parser.parse_args()
     missed = []
@@ -239,7 +268,7 @@ def main() -> int:
         if options.list:
             print(f"{k:3d} {m.fault}")
             continue
-        found = failures(m, options.tests)
+        found = failures(m, options.tests, options.stop_at)
         caught = ", ".join(re.sub(r".*test_(\w+)\.py::", r"\1: ", name) for name in found)
         print(f"{k:3d} {m.fault:60s} {caught or 'NOT NOTICED'}", flush=True)
         missed += [] if found else [m.fault]

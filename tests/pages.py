@@ -18,6 +18,9 @@ from PIL import Image
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "microsoft-edge")
 
+#: Why tests do not run without one. The summary of a test run says how many these are.
+NO_BROWSER = "needs Chromium or a relative of it"
+
 VOID = {"meta", "link", "img", "input", "br"}
 
 WATCH = """<script>
@@ -74,7 +77,7 @@ def in_browser(source: str, check: str, tmp_path: Path, width: int = 1200) -> An
     """
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
-        pytest.skip("needs Chromium or a relative of it")
+        pytest.skip(NO_BROWSER)
     watched = source.replace("<title>", f"{WATCH}<title>", 1).replace("</body>", f"{check}</body>", 1)
     (tmp_path / "page.html").write_text(watched, "utf-8")
     options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
@@ -83,8 +86,8 @@ def in_browser(source: str, check: str, tmp_path: Path, width: int = 1200) -> An
         command = [browser, *options, (tmp_path / "page.html").as_uri()]
         run = subprocess.run(command, capture_output=True, text=True, timeout=120)
     except (OSError, subprocess.TimeoutExpired) as error:
-        pytest.skip(f"{browser} does not run here: {error}")
+        pytest.skip(f"{NO_BROWSER}: {browser} does not run here: {error}")
     title = re.search(r"<title>(.*?)</title>", run.stdout, re.DOTALL)
     if title is None:
-        pytest.skip(f"{browser} does not run here: {run.stderr[-300:]}")
+        pytest.skip(f"{NO_BROWSER}: {browser} does not run here: {run.stderr[-300:]}")
     return json.loads(html.unescape(title[1]))

@@ -1,12 +1,14 @@
 """Derivative images against finite differences: every case of `cases.py`.
 
-`make test` takes few samples, which tell much where pixels are pooled; `make test-full` many.
+`make test` takes few samples, which tell much where pixels are pooled; `make test-full` many, and it writes a page of
+pictures.
 """
 
 import json
 import os
 
 import cases
+import gallery
 import pytest
 
 from rimlight.checks import FiniteDifferences, compare
@@ -22,7 +24,11 @@ MORE_NOISE = 1.5
 def test_agrees_with_finite_differences(case):
     if case.needs and not case.needs.exists():
         pytest.skip(f"needs {case.needs}")
-    agreement = compare(case.derivatives(LEAST), FiniteDifferences.read(case.reference))
+    derivatives, reference = case.derivatives(LEAST), FiniteDifferences.read(case.reference)
+    agreement = compare(derivatives, reference)
+    faults = agreement.faults(noise=MORE_NOISE * json.loads(cases.NOISE.read_text())[case.name])
     print(f"{case.name}: {agreement}")
+    if gallery.wanted():
+        gallery.keep(case.name, case.image(), derivatives, reference, agreement, faults)
     assert not agreement.zero
-    assert not agreement.faults(noise=MORE_NOISE * json.loads(cases.NOISE.read_text())[case.name])
+    assert not faults
