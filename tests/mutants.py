@@ -56,6 +56,8 @@ PARAMETRISATION = "edge_sampling/parametrisation.py"
 FILM = "edge_sampling/boundaries/film_boundary.py"
 SHADOWS = "edge_sampling/boundaries/shadow_boundary.py"
 SHADING = "edge_sampling/boundaries/shading_boundary.py"
+INDIRECT = "edge_sampling/boundaries/indirect_shadows.py"
+REPLAY = "plugins/transport/replay.py"
 
 MUTANTS = [
     # ---------------------- A term, 2 % too large ----------------------
@@ -72,7 +74,7 @@ MUTANTS = [
         "normal_velocity = 1.02 * dr.dot(points.n_dl, points.velocity)",
     ),
     mutant("shadows from lights: 2 % too large", SHADOWS, "value = jump * dr.dot", "value = 1.02 * jump * dr.dot"),
-    mutant("edges from points: 2 % too large", SHADING, "return -side * L", "return -1.02 * side * L"),
+    mutant("edges from points: 2 % too large", SHADING, "value = -side * L", "value = -1.02 * side * L"),
     mutant(
         "planes of faces: twice as large",
         "edge_sampling/boundaries/face_planes.py",
@@ -90,8 +92,8 @@ MUTANTS = [
     mutant(
         "edges from points: velocity of what is seen left out",
         SHADING,
-        " - _turning(n_dl, y - x, valid)",
-        "",
+        "(edge - beyond)",
+        "edge",
     ),
     mutant(
         "shadows from lights: motion of the light not followed",
@@ -119,9 +121,9 @@ MUTANTS = [
     ),
     mutant(
         "path replay: one vertex short",
-        "plugins/transport/paths.py",
-        "active = self.active & vertex.pi.is_valid() & depths.scatters(vertex.depth)",
-        "active = self.active & vertex.pi.is_valid() & depths.scatters(vertex.depth + 1)",
+        REPLAY,
+        "self.active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)",
+        "self.active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth + 1)",
     ),
     # ---------------------- Which edges there are ----------------------
     mutant(
@@ -141,8 +143,8 @@ MUTANTS = [
     mutant(
         "shadows from lights: only the first light",
         SHADOWS,
-        "if throws_shadows(emitters[i])])",
-        "if throws_shadows(emitters[i])][:1])",
+        "if self.counts(emitters[i])])",
+        "if self.counts(emitters[i])][:1])",
     ),
     mutant("tree of edges: not refitted", FOUND, "self.silhouettes.refit()", "pass"),
     mutant("edges: never found again", SEARCH, "        if same:\n", "        if self._sources is not None:\n"),
@@ -175,7 +177,7 @@ MUTANTS = [
     mutant(
         "edges from points: not shared with the lights' samples",
         SHADING,
-        "L *= dr.select(shared, mis, 1)",
+        "L *= dr.select(shared, 1 - theirs, 1)",
         "pass",
     ),
     mutant(
@@ -202,6 +204,31 @@ MUTANTS = [
         SHADING,
         "lift = si.spawn_ray(towards).o - si.p",
         "lift = 0 * towards",
+    ),
+    # ---------------------- Chains ----------------------
+    mutant(
+        "shadows in indirect light: 2 % too large",
+        INDIRECT,
+        "return jump * dr.dot(n_dl,",
+        "return 1.02 * jump * dr.dot(n_dl,",
+    ),
+    mutant(
+        "chain: cut behind the second vertex",
+        REPLAY,
+        "ray.o, ray.d = dr.replace_grad(ray.o, o), dr.replace_grad(ray.d, d)",
+        "ray.o, ray.d = dr.detach(ray.o), dr.detach(ray.d)",
+    ),
+    mutant(
+        "vicinity: its weight has no derivative",
+        SCATTERING,
+        "near = 1 - vicinity.far(dr.square(along))",
+        "near = 1 - vicinity.far(dr.square(dr.detach(along)))",
+    ),
+    mutant(
+        "edges from points: only what is seen past silhouettes counts",
+        SHADING,
+        "return value + faces * edge if tracer.scatters(2) else value",
+        "return value",
     ),
 ]
 

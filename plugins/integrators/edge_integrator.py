@@ -134,16 +134,21 @@ class EdgeIntegrator(ADIntegrator):
                 dr.set_grad(image, grad_in)
                 dr.enqueue(dr.ADMode.Backward, image)
                 dr.traverse(dr.ADMode.Backward)
-                for term, value in zip(terms, values, strict=True):
-                    gradient = dr.grad(value)
-                    if term.replay is not None:
-                        with dr.suspend_grad():
-                            start = term.replay.backward(gradient.L * term.throughput)
-                        dr.set_grad(term.replay.start, start)
-                        dr.enqueue(dr.ADMode.Backward, term.replay.start)
-                    dr.set_grad(term.value, gradient)
-                    dr.enqueue(dr.ADMode.Backward, term.value)
-                dr.traverse(dr.ADMode.Backward)
+                # The interior by itself, and first: traversed together with the film boundary, or after it, Dr.Jit 1.5
+                # loses what it gives to one mesh where another one has interpolated normals.
+                pairs = list(zip(terms, values, strict=True))
+                for group in (pairs[:1], pairs[1:]):
+                    for term, value in group:
+                        gradient = dr.grad(value)
+                        if term.replay is not None:
+                            with dr.suspend_grad():
+                                start = term.replay.backward(gradient.L * term.throughput)
+                            dr.set_grad(term.replay.start, start)
+                            dr.enqueue(dr.ADMode.Backward, term.replay.start)
+                        dr.set_grad(term.value, gradient)
+                        dr.enqueue(dr.ADMode.Backward, term.value)
+                    dr.traverse(dr.ADMode.Backward)
+                    dr.eval()
                 for cut in (cut for term in terms for cut in term.cuts):
                     cut.backward()
             dr.eval()
