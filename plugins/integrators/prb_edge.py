@@ -51,7 +51,7 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     **Interior.** The first vertex of a path is met by a ray that is fixed on the film. Others are *material points*,
     which follow their surfaces (Zhang et al. 2020), but close to the vertex before, they slide, since there the
     direction is held: so contacts and corners have a finite variance, but for a logarithm. In backward mode, paths are
-    written down, 84 bytes for each vertex and sample, and visited again from their end.
+    written down, 76 bytes for each vertex and sample, and visited again from their end.
 
     **Boundaries at shading points.** Each path keeps *one* of its vertices, chosen by a reservoir in proportion to
     throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows, hard
