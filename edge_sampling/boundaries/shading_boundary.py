@@ -254,7 +254,7 @@ class ShadingBoundary:
                 reflected = active & ~emission & (near > 0) & ~hidden & own
                 other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected)
                 # What its own faces show, held in its direction in the vicinity.
-                faces = dr.select(reflected, other_L, 0) - dr.select(active & ~past, L, 0)
+                faces = dr.select(reflected, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)
             L = dr.select(active & past, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)

@@ -17,6 +17,7 @@ from random_scenes import torus
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import Geometry, ShadingBoundary, Silhouettes, find_edges
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
+from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.transport.tracer import PathTracer
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
@@ -231,7 +232,7 @@ def test_points_on_the_lines_of_edges():
     integrator = mi.load_dict({"type": "prb_edge", "max_depth": 3})
     # Beyond the first vertex, where diffuse surfaces do not leave emitted light to `ShadowBoundary`.
     depth, β = dr.full(mi.UInt32, 2, len(x) * count), dr.ones(mi.Spectrum, len(x) * count)
-    point = ShadingPoint(si, depth, β, mi.Bool(True))
+    point = ShadingPoint(si, depth, β, mi.Bool(True), mi.Bool(False), Vicinity(mi.Float(0.5)), mi.Float(1))
     L = shading.sample(PathTracer(scene, integrator), placement, point, sampler, sampler.next_1d())
     derivative = np.array(dr.forward_to(L, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
     assert np.isfinite(derivative).all()
