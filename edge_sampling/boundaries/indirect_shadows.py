@@ -21,7 +21,7 @@ from rimlight.edge_sampling.choice.silhouettes import Placement
 from rimlight.edge_sampling.geometry.meshes import is_smooth
 from rimlight.edge_sampling.parametrisation import material_point
 
-from .shadow_boundary import ShadowBoundary, _fall, _thrown, _View
+from .shadow_boundary import SeenShadow, ShadowBoundary, fall, thrown
 from .tracer import ShadingPoint, Tracer
 
 
@@ -58,7 +58,7 @@ class IndirectShadows(ShadowBoundary):
         with dr.suspend_grad():
             light = self._point_on_light(scene, choice * len(self), z.time, sampler)
             edge = self._edge(placement, light, sampler)
-            shadow = _fall(scene, light, edge)
+            shadow = fall(scene, light, edge)
 
             # ---------------------- From the point to the shadow ----------------------
 
@@ -78,12 +78,12 @@ class IndirectShadows(ShadowBoundary):
             ray = mi.RayDifferential3f(shadow.ray)
             ray.wavelengths = z.wavelengths
             weight = f * dr.select(active, cos_over_r2 * ours, 0)
-            view = _View(mi.Point2f(0), ray, weight, shadow.fallen, si, None, active)
+            view = SeenShadow(mi.Point2f(0), ray, weight, shadow.fallen, si, None, active)
             met, jump, active = self._arriving(scene, light, edge, shadow, view, share=True)
 
             # ---------------------- The boundary on the surface ----------------------
 
-            tangent, towards_light = (_thrown(v, light, edge, shadow) for v in (edge.tangent, edge.lit))
+            tangent, towards_light = (thrown(v, light, edge, shadow) for v in (edge.tangent, edge.lit))
             n_dl = dr.cross(shadow.facing, tangent) * (len(self) / (edge.sample.density * light.density))
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)

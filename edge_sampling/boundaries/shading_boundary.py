@@ -229,13 +229,13 @@ class ShadingBoundary:
             n_dl = dr.select(active, n_dl, 0)
             aside = beside_edge(p, x)
 
-            def look(side, active):
+            def look(side, active, slack=1):
                 """What is seen beside the edge, unless something before the edge hides it."""
                 ray = si.spawn_ray(dr.normalize(mi.Point3f(p + side * aside * across) - x))
                 pi = scene.ray_intersect_preliminary(ray, active=active)
                 y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
                 # Not a surface on which the edge lies: beside the edge, that may be met a little earlier.
-                off = dr.abs_dot(y.n, p - y.p) > aside
+                off = dr.abs_dot(y.n, p - y.p) > slack * aside
                 return ray, pi, y, pi.is_valid() & (pi.t < distance) & off, pi.is_valid() & ~off
 
             side = dr.select(outward != 0, outward, 1)
@@ -250,7 +250,8 @@ class ShadingBoundary:
                 again = sampler.clone()
                 reflected = valid & ~emission
                 L += dr.select(reflected, tracer.scattered(ray, pi, point.depth, sampler, reflected), 0)
-                other_ray, other_pi, _, hidden, own = look(-side, active & ~emission & (near > 0))
+                # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
+                other_ray, other_pi, _, hidden, own = look(-side, active & ~emission & (near > 0), slack=2)
                 reflected = active & ~emission & (near > 0) & ~hidden & own
                 other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected)
                 # What its own faces show, held in its direction in the vicinity.

@@ -103,7 +103,7 @@ class ShadowBoundary:
             time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
             light = self._point_on_light(tracer.scene, choice, time, sampler)
             edge = self._edge(placement, light, sampler)
-            shadow = _fall(tracer.scene, light, edge)
+            shadow = fall(tracer.scene, light, edge)
             view = _look(tracer, projection, sensor, sampler, light.time, shadow)
             met, jump, active = self._arriving(tracer.scene, light, edge, shadow, view, share=share)
 
@@ -113,7 +113,7 @@ class ShadowBoundary:
                 shadow.x, mi.Point3f(shadow.x + v), mi.Float(0), view.aperture_sample
             )
             tangent, towards_light = (
-                dr.detach(on_film(_thrown(v, light, edge, shadow))) for v in (edge.tangent, edge.lit)
+                dr.detach(on_film(thrown(v, light, edge, shadow))) for v in (edge.tangent, edge.lit)
             )
             n_dl = mi.Vector2f(-tangent.y, tangent.x) / (edge.sample.density * light.density * (count / len(self)))
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
@@ -203,7 +203,7 @@ class ShadowBoundary:
     # ---------------------- What arrives where the shadow falls ----------------------
 
     def _arriving(
-        self, scene: mi.Scene, light: _LightPoint, edge: _Edge, shadow: _Shadow, view: _View, *, share: bool
+        self, scene: mi.Scene, light: _LightPoint, edge: _Edge, shadow: _Shadow, view: SeenShadow, *, share: bool
     ) -> tuple[mi.PreliminaryIntersection3f, mi.Spectrum, mi.Bool]:
         """What a ray to the light meets; the radiance that the sensor sees of this light beside the shadow, and is it
         there?"""
@@ -299,7 +299,7 @@ class _Shadow:
 
 
 @dataclass
-class _View:
+class SeenShadow:
     """The shadow as the sensor sees it: at the position u of the film, in pixels."""
 
     u: mi.Point2f
@@ -311,7 +311,7 @@ class _View:
     active: mi.Bool
 
 
-def _fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
+def fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
     p, ω, far = edge.p, edge.ω, light.far
     aside = edge.lit * beside_edge(p, dr.select(far, p, light.y))
     ray = mi.Ray3f(p + aside, ω)
@@ -332,7 +332,7 @@ def _fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
 
 def _look(
     tracer: Tracer, projection: Projection, sensor: mi.Sensor, sampler: mi.Sampler, time: mi.Float, shadow: _Shadow
-) -> _View:
+) -> SeenShadow:
     """Does the sensor see it?"""
     x = shadow.x
     aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
@@ -354,10 +354,10 @@ def _look(
     # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off it, but
     # less than the ray will start above it.
     active &= dr.abs_dot(si.n, x - si.p) <= shadow.lift + rounding(x, ray.o)
-    return _View(u, ray, weight, seen, si, aperture_sample, active)
+    return SeenShadow(u, ray, weight, seen, si, aperture_sample, active)
 
 
-def _thrown(v: mi.Vector3f, light: _LightPoint, edge: _Edge, shadow: _Shadow) -> mi.Vector3f:
+def thrown(v: mi.Vector3f, light: _LightPoint, edge: _Edge, shadow: _Shadow) -> mi.Vector3f:
     """How the shadow moves over what it falls on if the point of the edge moves by v."""
     facing, d = shadow.facing, edge.d
     s = dr.select(light.far, 1, dr.dot(facing, shadow.x + facing * shadow.lift - light.y) / dr.dot(facing, d))

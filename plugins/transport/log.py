@@ -12,9 +12,12 @@ from .scattering import Numbers
 class Log:
     """A table of the vertices of paths: for each sample and each number along the path, at most 84 bytes.
 
-    width : number of samples.
     like : mi.Ray3f, of the time and the wavelengths of the paths.
     first, last : numbers of the vertices that it has room for.
+
+    Raises
+    ------
+    RuntimeError : it would have more numbers than 32 bits can count.
     """
 
     def __init__(self, scene: mi.Scene, like: mi.Ray3f, first: int, last: int):
@@ -22,6 +25,11 @@ class Log:
         self.width, self.first, self.last = dr.width(like.o), first, last
         width = self.width
         n = width * max(last + 1 - first, 1)
+        if n * max(3, dr.size_v(mi.Spectrum)) >= 2**32:
+            raise RuntimeError(
+                f"{width} samples of paths of up to {last} vertices are more than a table can hold: use fewer samples "
+                'per pixel and average several seeds, or a lower "max_depth"'
+            )
         floats = {"o": 3, "d": 3, "t": 1, "uv": 2, "light": 2, "lobe": 1, "direction": 2}
         self._floats = {name: dr.empty(mi.Float, n * size) for name, size in floats.items()}
         instances = any(s.class_name() == "Instance" for s in scene.shapes())

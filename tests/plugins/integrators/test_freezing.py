@@ -184,7 +184,23 @@ def test_says_that_the_edges_must_be_found_before():
     params.update()
     with pytest.raises(RuntimeError) as error:
         dr.freeze(Step().__call__)(scene, integrator, dr.opaque(mi.UInt32, 0))
-    cause = error.value
-    while cause.__cause__ is not None:
-        cause = cause.__cause__
-    assert "state_fn" in str(cause) and "find_boundaries" in str(cause)
+    cause = first_cause(error.value)
+    assert "state_fn" in cause and "find_boundaries" in cause
+
+
+def test_says_that_paths_need_a_limit():
+    scene, integrator = cases.two_triangles(), mi.load_dict({"type": "prb_edge", "max_depth": -1})
+    params = mi.traverse(scene)
+    key = "green.vertex_positions"
+    params[key] = numbers(params[key])
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(RuntimeError) as error:
+        Step().frozen()(scene, integrator, dr.opaque(mi.UInt32, 0))
+    assert 'set "max_depth" to at most' in first_cause(error.value)
+
+
+def first_cause(error: BaseException) -> str:
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error)
