@@ -11,7 +11,8 @@ there move, the derivative of the integral gains
 over the directions ω(φ) in the plane; with the BSDF times its cosine F, the light L and its point y just above the
 plane, and just below. As in `shading_boundary.py`, y is a *material point*, which the interior derivative holds fixed.
 
-What a camera sees of such faces jumps at the edges between them (`film_boundary.py`).
+What a camera sees of such faces jumps at the edges between them (`film_boundary.py`): what one face hides and the next
+does not is the light from between their planes (`lune.py`).
 """
 
 from __future__ import annotations

@@ -27,6 +27,7 @@ from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
+from .lune import Lune
 from .tracer import Tracer
 
 #: How far beside the edges of meshes that light goes through to look, in units of the offset of Mitsuba's rays.
@@ -60,6 +61,7 @@ class BoundaryPoints:
     weights  : of these rays.
     active   : mi.Bool, (N,)
     horizons : on which side of a horizon of interpolated normals each of the rays is; None where there are none.
+    lune : from where all light comes that can jump, where it is active; None where there are none.
     sensor_moves : does the velocity depend on parameters of the sensor?
     """
 
@@ -70,6 +72,7 @@ class BoundaryPoints:
     weights: list[mi.Spectrum]
     active: mi.Bool
     horizons: list[Horizon | None]
+    lune: Lune | None
     sensor_moves: bool
 
 
@@ -133,7 +136,7 @@ class FilmBoundary:
             jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
             sides = zip((-1, 1), points.rays, points.weights, points.horizons, strict=True)
             for sign, ray, weight, horizon in sides:
-                L, alpha = tracer.seen(ray, sampler.clone(), points.active, horizon)
+                L, alpha = tracer.seen(ray, sampler.clone(), points.active, horizon, points.lune)
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
             if points.sensor_moves:
@@ -179,7 +182,8 @@ class FilmBoundary:
             active = self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, active)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
             n_dl = dr.select(active, n_dl, 0)
-            return BoundaryPoints(u, n_dl, velocity, rays, weights, active, horizons, at.projection.attached)
+            lune = outlines.lune(at, chosen, lights)
+            return BoundaryPoints(u, n_dl, velocity, rays, weights, active, horizons, lune, at.projection.attached)
 
     # ---------------------- What is on their sides ----------------------
 

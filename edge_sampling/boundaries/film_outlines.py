@@ -15,6 +15,7 @@ from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
 
 from .horizon import HorizonPoint, Horizons
+from .lune import Lune
 
 #: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
 #: an edge that cannot be seen changes nothing, not even the last bit.
@@ -80,7 +81,7 @@ class FilmOutlines:
     geometry, edges, moving, soft : see `FilmBoundary`.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "horizons", "curves", "counts", "soft"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "spreads", "horizons", "curves", "counts", "soft"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool):
         self.geometry, self.soft = geometry, soft
@@ -88,6 +89,9 @@ class FilmOutlines:
         # (Dr.Jit 1.5 cannot freeze empty arrays.)
         self.edges = DeviceEdges(edges) if len(edges) else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
+        #: Which edges are on meshes that reflect light from all directions, but from behind?
+        spreads = np.array([_spreads(m.bsdf()) for m in geometry.meshes])
+        self.spreads = mi.Bool(spreads[edges.mesh[:, 0]]) if len(edges) else None
         shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
         shapes = tuple(s for s, moves in shapes if moves)
         self.curves = Curves(shapes) if shapes else None
@@ -179,12 +183,23 @@ class FilmOutlines:
         eye, far = at.projection.viewer(at.aperture_sample), at.projection.orthographic
         return self.horizons.point(at.positions, at.normals, chosen.face, chosen.along, eye, far)
 
+    def lune(self, at: Placed, chosen: Chosen, lights: mi.Vector4f | None) -> Lune | None:
+        """From where the light comes that jumps at edges which only the planes of their faces make a boundary; active
+        where it comes from nowhere else. None if there are no such edges. lights : see `Lights.places`."""
+        if self.edges is None or not self.soft or not self.any_smooth:
+            return None
+        edge = chosen.edge
+        soft = chosen.is_edge & dr.gather(mi.Bool, self.spreads, edge) & ~self._jumps(at, edge, lights)
+        a, b = self.edges.end_points(at.positions, edge)
+        first, second = self.edges.normals(at.positions, edge)
+        return Lune.between(b - a, (first, -second), soft)
+
     # ---------------------- Lengths ----------------------
 
-    def _jumps(self, at: Placed, edge: mi.UInt32) -> mi.Bool:
-        """Does something jump at the edge, as seen from the sensor?"""
+    def _jumps(self, at: Placed, edge: mi.UInt32, lights: mi.Vector4f | None) -> mi.Bool:
+        """Does more jump at the edge, as seen from the sensor, than soft light that the planes of its faces hide?"""
         projection = at.projection
-        return self.edges.is_boundary(
+        jumps = self.edges.is_boundary(
             at.positions,
             edge,
             projection.eye(),
@@ -192,6 +207,9 @@ class FilmOutlines:
             radius=projection.lens_radius(),
             geometry=self.geometry,
         )
+        if lights is not None:
+            jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights)
+        return jumps
 
     def visible_lengths(self, at: Placed, lights: mi.Vector4f | None) -> mi.Float:
         """Length inside the frame of each edge, cut, horizon and piece of a curve, 0 where nothing can jump: pixels on
@@ -199,9 +217,7 @@ class FilmOutlines:
         lengths, projection, positions = [], at.projection, at.positions
         if self.edges is not None:
             edge, face = (dr.arange(mi.UInt32, n) for n in self.counts[:2])
-            jumps = self._jumps(at, edge)
-            if lights is not None:
-                jumps |= self.edges.is_silhouette_of_any(positions, edge, lights)
+            jumps = self._jumps(at, edge, lights)
             for a, b in (self.edges.end_points(positions, edge), self._cut(at, face)):
                 lengths.append(projection.clip(a, b).length)
             # The less faces turn, the less their planes hide: about as the square of the angle.
@@ -266,3 +282,8 @@ class FilmOutlines:
             t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)
             points.append(dr.select(crossed, dr.lerp(corners[0], corners[k], t), dr.nan))
         return points[0], points[1]
+
+
+def _spreads(bsdf: mi.BSDF | None) -> bool:
+    """Does it reflect light from all directions, and let none through?"""
+    return bsdf is not None and not bsdf.flags() & (mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)

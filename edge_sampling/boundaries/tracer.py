@@ -10,6 +10,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .horizon import Horizon
+from .lune import Lune
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,10 @@ class Tracer(Protocol):
         """What the sensor sees along camera rays."""
 
     def seen(
-        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None
+        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None, lune: Lune | None
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Radiance and alpha along camera rays, of which the first hit is on a side of a horizon."""
+        """Radiance and alpha along camera rays, of which the first hit is on a side of a horizon. Where there is a
+        lune, only light from there need be reflected: what else there is does not jump."""
 
     def scattered(
         self,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below
 from rimlight.edge_sampling.parametrisation import Parametrisation, Vicinity, shown_by_mirror
@@ -88,14 +89,17 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
+        lune: Lune | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Direct illumination that `si` reflects, and the next vertex.
 
         vicinity : in which that slides; None: it is a material point.
         met : what the ray to it meets, if that is known.
+        lune : where it is active, only light from there is reflected. Only where no gradients are carried.
         """
-        from_emitter = self.sample_emitter(si, bsdf, numbers.light, active) if self.any else 0
-        from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met)
+        by_light = active if lune is None else active & ~lune.active
+        from_emitter = self.sample_emitter(si, bsdf, numbers.light, by_light) if self.any else 0
+        from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met, lune)
         with dr.resume_grad(when=self.attached):
             return from_bsdf + from_emitter, onwards
 
@@ -176,11 +180,12 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
+        lune: Lune | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
         vertex. The arguments are those of `scatter`."""
         scene, context = self.scene, mi.BSDFContext()
-        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, met)
+        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, met, lune)
         ray, pi, weight, mirrored = onwards.ray, onwards.pi, onwards.weight, onwards.mirrored
         active = active & dr.any(weight != 0)
         if not self.attached:
@@ -224,8 +229,9 @@ class Scattering:
             if len(self.held.smooth_lamps) and self.attached:
                 bsdf_pdf = bsdf.pdf(context, si, si.to_local(ω), active & ~mirrored)
                 mis = to_y.attach(mis, bsdf_pdf, pdf, by_light=False)
-            mis = dr.select(mirrored, 1, mis)
-            Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
+            alone = mirrored if lune is None else mirrored | lune.active
+            mis = dr.select(alone, 1, mis)
+            Le = dr.select(active, weight * self._emission(emitter, y, alone, active) * mis, 0)
         return Le, onwards
 
     @staticmethod
@@ -275,9 +281,9 @@ class Scattering:
             found |= several.of_light(ds)
         return found
 
-    def _emission(self, emitter, y, mirrored, active) -> mi.Spectrum:
-        """What the BSDF sample sees at y."""
-        without = active & self._of_several(emitter) & ~mirrored
+    def _emission(self, emitter, y, alone, active) -> mi.Spectrum:
+        """What the BSDF sample sees at y. alone : no light sample can see it."""
+        without = active & self._of_several(emitter) & ~alone
         L = emitter.eval(y, active & ~without)
         for several in self.several:
             mine = without & (emitter == mi.EmitterPtr(several))
@@ -292,12 +298,20 @@ def next_vertex(
     numbers: Numbers,
     active: mi.Bool,
     met: mi.PreliminaryIntersection3f | None = None,
+    lune: Lune | None = None,
 ) -> tuple[mi.BSDFSample3f, Next]:
     """A direction sampled from the BSDF, and the vertex there. Detached.
 
     met : what the ray to it meets, if that is known.
+    lune : where it is active, the direction is sampled from there. The BSDF has no perfect reflection, and lets nothing
+        through.
     """
     bs, weight = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, active)
+    if lune is not None:
+        ω, pdf = lune.sample(numbers.lobe, numbers.direction)
+        bs.wo, bs.pdf = dr.select(lune.active, si.to_local(ω), bs.wo), dr.select(lune.active, pdf, bs.pdf)
+        there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & lune.active) / pdf
+        weight = dr.select(lune.active, there, weight)
     active = active & dr.any(weight != 0)
     ray = si.spawn_ray(si.to_world(bs.wo))
     pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met

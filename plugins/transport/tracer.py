@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side
+from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
 
@@ -57,10 +58,12 @@ class PathTracer:
         *,
         attached: bool,
         horizon: Horizon | None = None,
+        lune: Lune | None = None,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
 
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
+        lune : from where that reflects light, where it is active; lights without a size are left out there.
         """
         scene = self.scene
         active = active & (self.depths.max_depth > 0)
@@ -85,7 +88,7 @@ class PathTracer:
         # ---------------------- Light that it scatters ----------------------
 
         vicinity = Vicinity.of(pi) if attached and self.scatters(2) else None
-        direct, onwards = scattering.scatter(si, bsdf, scattering.draw(sampler, active), active, vicinity)
+        direct, onwards = scattering.scatter(si, bsdf, scattering.draw(sampler, active), active, vicinity, lune=lune)
         with dr.resume_grad(when=attached):
             L += direct
         valid = backdrop | (active & ~onwards.through)
@@ -111,10 +114,10 @@ class PathTracer:
         return pi
 
     def seen(
-        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None
+        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None, lune: Lune | None
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, detached."""
-        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon)
+        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, lune=lune)
         return found.L, dr.select(found.valid, mi.Float(1), 0)
 
     # ---------------------- From points of a path ----------------------
