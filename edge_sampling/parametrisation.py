@@ -6,7 +6,8 @@ it: what the interior term holds fixed is what the sides of a boundary move with
 ====================================  ======================================================================
 what the camera sees                  the film position: the *ray* is fixed on the film, and moves with the camera
 every further vertex of a path        far from the vertex before: the *material point*, which follows its surface;
-                                      close to it: the direction, so that the vertex slides over its surface
+                                      close to it, or behind rough glass: the direction, so that the vertex
+                                      slides over its surface
 a point on a lamp                     the material point
 one side of a boundary                as the interior term has the point that is seen there
 a point of a light without size       the light's own numbers: it goes where the light goes
@@ -21,6 +22,10 @@ moves together sees no motion at all.
 Where two surfaces meet and only one of x and y moves, the change of 1 / r² has no finite variance. So scattered light
 is divided: the part `far(r)` of what arrives from a point at the distance r is held at the material point, the rest in
 its direction. Both parts add up to the whole, so that the division may be chosen at will (`Vicinity`).
+
+Through rough glass, a surface looks in few directions. Of a material point that moves out of them, the change relative
+to its value is large. So what rough glass shows is held in its direction, however far it is; but not where there are
+interpolated normals: what slides over such a mesh jumps at the edges of its faces (`boundaries/lune.py`).
 """
 
 from __future__ import annotations
@@ -131,21 +136,46 @@ def flush(x: mi.SurfaceInteraction3f, y: mi.SurfaceInteraction3f) -> mi.Bool:
 class Vicinity:
     """The ball around each vertex of a path in which the next one slides.
 
-    radius : mi.Float, (N,), scene units, the same for all vertices of a path; detached. 0: nothing slides.
+    radius : mi.Float, (N,), scene units; detached. 0: nothing slides; infinite: everything does.
+    glass : is that of rough glass infinite? See `slides_behind_glass`.
     """
 
     radius: mi.Float
+    glass: bool = False
 
     @staticmethod
-    def of(first: mi.PreliminaryIntersection3f) -> Vicinity:
+    def of(first: mi.PreliminaryIntersection3f, glass: bool = False) -> Vicinity:
         """That of the paths which meet their first vertex there."""
-        return Vicinity(dr.select(first.is_valid(), VICINITY * first.t, 0))
+        return Vicinity(dr.select(first.is_valid(), VICINITY * first.t, 0), glass)
+
+    def around(self, bsdf: mi.BSDFPtr) -> Vicinity:
+        """That of a vertex on a surface with this BSDF."""
+        return Vicinity(dr.select(self.is_infinite(bsdf), dr.inf, self.radius)) if self.glass else self
+
+    def is_infinite(self, bsdf: mi.BSDFPtr) -> mi.Bool:
+        """Does everything slide that a surface with this BSDF shows?"""
+        if not self.glass:
+            return mi.Bool(False)
+        flags = bsdf.flags()
+        rough = mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission) & ~mi.has_flag(flags, mi.BSDFFlags.Diffuse)
+        return rough & (self.radius > 0)
 
     def far(self, r2: mi.Float) -> mi.Float:
         """Part of the light from the squared distance `r2` that is held at the material point: 1 from the radius on,
         and in proportion to r2 near 0. It may be attached."""
         s = dr.select(self.radius > 0, dr.minimum(r2 / dr.square(dr.maximum(self.radius, 1e-18)), 1), 1)
         return 1 - (1 - s) * dr.square(1 - s)
+
+
+def slides_behind_glass(scene: mi.Scene, shaded: list[mi.Shape]) -> bool:
+    """May all that rough glass shows slide? There must be some, and no face that other normals than its own shade.
+
+    shaded : the shapes with such faces.
+    """
+    bsdfs = [s.bsdf() for s in scene.shapes()]
+    if shaded or None in bsdfs:
+        return False
+    return any(b.flags() & mi.BSDFFlags.GlossyTransmission for b in bsdfs)
 
 
 # ---------------------- What joins two of them ----------------------

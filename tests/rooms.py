@@ -87,11 +87,33 @@ def sun_through_window() -> mi.Scene:
     return scene(sensor=camera((0.2, 0.8, -3.2), (0.0, 0.75, 1), fov=20), **walls(), board=board, sun=sun)
 
 
+def rough_panes() -> mi.Scene:
+    """Two panes of rough glass before a lamp with a picture, as in Mitsuba's `TranslateGlassPlaneLens`; a matt plate
+    slides between them."""
+    glass = {"type": "roughdielectric", "distribution": "beckmann", "alpha": 0.8, "int_ior": 1.001, "ext_ior": 1.1}
+    pane = lambda name, z: quad((-4, -4, z), (8, 0, 0), (0, 8, 0), name, bsdf=glass)
+    x, y = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 16))
+    picture = np.stack([x, y, 1 - x * y], -1).astype(np.float32) * 4
+    shown = {"type": "bitmap", "bitmap": mi.Bitmap(picture), "raw": True, "wrap_mode": "clamp"}
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, -1]),
+        "bsdf": diffuse(0.0),
+        "emitter": {"type": "area", "radiance": shown},
+    }
+    plate = quad((-0.5, -0.3, 0.4), (0.5, 0, 0.2), (0, 0.6, 0), "plate", bsdf=diffuse(0.6, 0.3, 0.2, two_sided=True))
+    panes = {"front": pane("front", 1), "back": pane("back", 0)}
+    spot = {"type": "point", "position": [0.3, 0.8, 0.8], "intensity": 2.0}
+    return scene(sensor=camera((0, 0, 2), (0, 0, 0)), **panes, plate=plate, lamp=lamp, spot=spot)
+
+
 BOX_ALONG = {"key": "box.vertex_positions", "direction": [1, 0, 0]}
 DOLLY = {"key": "sensor.to_world", "direction": [-0.53, -0.31, 0.79]}
 BALL_ALONG = {"key": "ball.vertex_positions", "direction": [1, 0, 0.5]}
 SCREEN_ALONG = {"key": "screen.vertex_positions", "direction": [1, 0, 0.3]}
 BOARD_ALONG = {"key": "board.vertex_positions", "direction": [1, 0, 0.3]}
+
+PLATE_ALONG = {"key": "plate.vertex_positions", "direction": [1, 0.3, 0]}
 
 #: Of each case: scene, motion, step.
 ROOMS: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
@@ -100,4 +122,5 @@ ROOMS: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
     "ball_on_floor": (ball_on_floor, BALL_ALONG, 6e-3),
     "spot_behind_screen": (spot_behind_screen, SCREEN_ALONG, 4e-2),
     "sun_through_window": (sun_through_window, BOARD_ALONG, 4e-2),
+    "rough_panes": (rough_panes, PLATE_ALONG, 1e-2),
 }

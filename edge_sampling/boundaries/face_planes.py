@@ -66,13 +66,14 @@ class FacePlanes:
                     scattered = dr.select(onwards, scattered, 0)
                 jumps = [dr.select(reflects, side * F * L, 0) for L in (emitted, scattered)]
                 sides.append((ray, pi, reflects & y.is_valid(), jumps))
+            vicinity = point.vicinity.around(at.bsdf())
         value = mi.Spectrum(0)
         with dr.resume_grad():
             for ray, pi, valid, jumps in sides:
                 d = material_point(ray, pi, valid).p - si.p
                 # What is infinitely far away is seen in a fixed direction.
                 towards = dr.normalize(dr.select(valid, d, mi.Vector3f(ω)))
-                far = point.vicinity.far(dr.detach(dr.squared_norm(d)))
+                far = vicinity.far(dr.detach(dr.squared_norm(d)))
                 # What emits is a material point everywhere, what scatters only far away.
                 for jump, held in zip(jumps, (1, dr.select(valid, far, 1)), strict=True):
                     g = dr.dot(si.n, dr.lerp(dr.detach(towards), towards, held))

@@ -81,7 +81,8 @@ class FilmOutlines:
     geometry, edges, moving, soft : see `FilmBoundary`.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("edges", "corners", "spreads", "horizons", "curves", "counts", "soft"))  # for `dr.freeze`
+    _PARTS = ("edges", "corners", "spreads", "horizons", "curves")
+    DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool):
         self.geometry, self.soft = geometry, soft

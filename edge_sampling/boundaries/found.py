@@ -16,7 +16,8 @@ from .shadow_boundary import ShadowBoundary
 @dataclass(frozen=True)
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
-    does. Nothing where nothing moves. `limits` : what the derivative will lack."""
+    does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see
+    `Vicinity`."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -27,6 +28,7 @@ class Boundaries:
     camera_moves: bool = False
     lights_move: bool = False
     limits: tuple[str, ...] = ()
+    glass: bool = False
 
     @property
     def silhouettes(self) -> Silhouettes | None:

@@ -88,7 +88,7 @@ class IndirectShadows(ShadowBoundary):
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl = dr.select(active, n_dl, 0)
-            far, n = point.vicinity.far(r2), si.n
+            far, n = point.vicinity.around(z.bsdf()).far(r2), si.n
 
         with dr.resume_grad():
             m = material_point(shadow.ray, shadow.fallen, active).p

@@ -136,7 +136,7 @@ class ShadingBoundary:
                 cone,
             )
             # Of what scatters light, both sides of each edge count close by.
-            vicinity = Vicinity(dr.select(emission, 0, point.vicinity.radius))
+            vicinity = Vicinity(dr.select(emission, 0, point.vicinity.around(bsdf).radius))
             if tracer.scatters(2):
                 view.vicinity = vicinity
             # What is seen past an edge that stands still may move. What emits does not: else all would be in one group.

@@ -22,7 +22,7 @@ class ShadingPoint:
     β : mi.Spectrum, throughput up to there, over the probability of this point among those of its path. Detached.
     active : mi.Bool, is there one?
     slides : mi.Bool, may it move with the vertices before, though its surface stands still?
-    vicinity : in which the next vertex slides.
+    vicinity : that of its path.
     density : mi.Float, by area, with which it was found from the vertex before; infinite if that is a mirror. Detached.
     """
 

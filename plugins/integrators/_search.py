@@ -23,6 +23,7 @@ from rimlight.edge_sampling import (
     find_welded_edges,
 )
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.transport.paths import Depths
 
 from ._limits import Media, Moving, PartialParameters, beyond_far_plane, lasting_limits
@@ -145,7 +146,10 @@ class BoundarySearch:
         shadows, shading, indirect = self._in_reflected_light(scene, moving, sppi)
         abilities = {"planes": self.planes, "from_points": self.from_points}
         limits = lasting_limits(scene, self.geometry, self.edges, self.depths, moving, sppi, **abilities)
-        return Boundaries(film, shadows, shading, indirect, planes, moving.flags, moving.camera, moving.lights, limits)
+        glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
+        glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
+        what = moving.flags, moving.camera, moving.lights
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass)
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int

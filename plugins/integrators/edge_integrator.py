@@ -186,7 +186,9 @@ class EdgeIntegrator(ADIntegrator):
         counts = self._counts(sensor, spp)
         boundaries = self._boundaries(scene, sensor, counts.shading)
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
-        return Job(self.TRACER(scene, self), sensor, boundaries, counts, rays, seed, mode)
+        tracer = self.TRACER(scene, self)
+        tracer.glass = boundaries.glass
+        return Job(tracer, sensor, boundaries, counts, rays, seed, mode)
 
     @no_collection()
     def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:

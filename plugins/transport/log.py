@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .paths import Vertex
-from .scattering import Numbers
+from .scattering import Next, Numbers
 
 
 class Log:
@@ -40,14 +40,16 @@ class Log:
     def _row(self, depth: mi.UInt32) -> mi.UInt32:
         return (depth - self.first) * self.width + dr.arange(mi.UInt32, self.width)
 
-    def arrive(self, depth: mi.UInt32, ray, pi, mirrored: mi.Bool, active: mi.Bool) -> None:
+    def arrive(self, depth: mi.UInt32, vertex: Vertex | Next, active: mi.Bool) -> None:
         """Note the ray to a vertex, and what it meets."""
         row, active = self._row(depth), active & (depth <= self.last)
-        # The sign of the distance says whether a mirror shows it.
-        t = dr.select(mirrored, -pi.t, pi.t)
+        ray, pi = vertex.ray, vertex.pi
+        # The sign of the distance says whether a mirror shows it; the last bit of the triangle, whether it slides.
+        t = dr.select(vertex.mirrored, -pi.t, pi.t)
+        prim = (pi.prim_index << 1) | dr.select(vertex.slides, mi.UInt32(1), 0)
         for name, value in {"o": ray.o, "d": ray.d, "t": t, "uv": pi.prim_uv}.items():
             dr.scatter(self._floats[name], value, row, active, mode=dr.ReduceMode.NoConflicts)
-        whole = {"prim": pi.prim_index, "shape": pi.shape, "shape_index": pi.shape_index, "instance": pi.instance}
+        whole = {"prim": prim, "shape": pi.shape, "shape_index": pi.shape_index, "instance": pi.instance}
         for name, target in self._whole.items():
             value = whole[name]
             value = value if isinstance(value, mi.UInt32) else dr.reinterpret_array(mi.UInt32, value)
@@ -74,12 +76,13 @@ class Log:
         pi = dr.zeros(mi.PreliminaryIntersection3f, self.width)
         pi.t = dr.select(active, dr.abs(t), dr.inf)
         pi.valid = dr.isfinite(pi.t)
-        pi.prim_uv, pi.prim_index = number(mi.Point2f, "uv"), whole("prim")
+        prim = whole("prim")
+        pi.prim_uv, pi.prim_index = number(mi.Point2f, "uv"), prim >> 1
         pi.shape = dr.reinterpret_array(mi.ShapePtr, whole("shape"))
         if "instance" in self._whole:
             pi.shape_index = whole("shape_index")
             pi.instance = dr.reinterpret_array(mi.ShapePtr, whole("instance"))
-        return Vertex(ray, pi, depth, mi.Spectrum(1), mi.Float(1), t < 0)
+        return Vertex(ray, pi, depth, mi.Spectrum(1), mi.Float(1), t < 0, (prim & 1) != 0)
 
     def β(self, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         return dr.gather(mi.Spectrum, self._β, self._row(depth), active)

@@ -22,6 +22,7 @@ class Vertex:
     β : mi.Spectrum, throughput up to it.
     η : mi.Float, product of the relative indices of refraction up to it.
     mirrored : mi.Bool, is it what a perfect mirror or a smooth glass shows?
+    slides : mi.Bool, does it slide over its surface, however far it is from the vertex before?
     """
 
     ray: mi.Ray3f
@@ -30,6 +31,7 @@ class Vertex:
     β: mi.Spectrum
     η: mi.Float
     mirrored: mi.Bool
+    slides: mi.Bool
 
 
 @dataclass(frozen=True)
@@ -102,10 +104,10 @@ def choose_vertex(
         kept, kept_since = dr.select(taken, vertex, kept), dr.select(taken, since, kept_since)
         kept_density = dr.select(taken, density * dr.abs_dot(si.n, vertex.ray.d), kept_density)
         numbers = Numbers(mi.Point2f(0), sampler.next_1d(active), sampler.next_2d(active))
-        bs, onwards = next_vertex(scene, si, bsdf, numbers, active & depths.scatters(vertex.depth + 1))
+        bs, onwards = next_vertex(scene, si, bsdf, numbers, active & depths.scatters(vertex.depth + 1), vicinity)
         note(vertex, numbers, onwards, active)
         r2 = dr.square(onwards.pi.t)
-        slides = onwards.mirrored | (vicinity.far(r2) < 1)
+        slides = onwards.slides | (vicinity.far(r2) < 1)
         since = dr.select(slides, since, vertex.depth + 1)
         density = dr.select(onwards.mirrored, dr.inf, bs.pdf / r2)
         vertex, active = step(vertex, onwards, sampler, depths, active)
@@ -133,4 +135,4 @@ def step(vertex, onwards, sampler, depths, active):
     ends = (depth >= depths.rr_depth) & (sampler.next_1d(active) >= p)
     β = dr.select(depth >= depths.rr_depth, β * dr.rcp(p), β)
     active = active & onwards.pi.is_valid() & depths.scatters(depth) & dr.any(β != 0) & ~ends
-    return Vertex(mi.Ray3f(onwards.ray), onwards.pi, depth, β, η, onwards.mirrored), active
+    return Vertex(mi.Ray3f(onwards.ray), onwards.pi, depth, β, η, onwards.mirrored, onwards.slides), active

@@ -52,7 +52,7 @@ class Chain:
             ray = mi.Ray3f(vertex.ray)
             ray.o, ray.d = dr.replace_grad(ray.o, o), dr.replace_grad(ray.d, d)
             far = self.vicinity.far(dr.square(vertex.pi.t))
-            si = sliding_point(ray, vertex.pi, dr.select(vertex.mirrored, 0, far), active)
+            si = sliding_point(ray, vertex.pi, dr.select(vertex.slides, 0, far), active)
             if self.scattering.directional:
                 look_from(si, ray.o)
             return si
@@ -182,15 +182,15 @@ class Replay:
         """Write the paths down; returns the number of the last vertex of each that scatters, 0 if there is none."""
         scattering, scene = self.chain.scattering, self.scene
         if log is not None:
-            log.arrive(self.vertex.depth, self.vertex.ray, self.vertex.pi, self.vertex.mirrored, self.active)
+            log.arrive(self.vertex.depth, self.vertex, self.active)
 
         def bounce(last, vertex, active, sampler):
             si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
             numbers = scattering.draw(sampler, active)
-            _, onwards = next_vertex(scene, si, si.bsdf(vertex.ray), numbers, active)
+            _, onwards = next_vertex(scene, si, si.bsdf(vertex.ray), numbers, active, self.chain.vicinity)
             if log is not None:
                 log.leave(vertex.depth, vertex.β, numbers, active)
-                log.arrive(vertex.depth + 1, onwards.ray, onwards.pi, onwards.mirrored, active)
+                log.arrive(vertex.depth + 1, onwards, active)
             last = dr.select(active, vertex.depth, last)
             vertex, active = step(vertex, onwards, sampler, self.depths, active)
             return last, vertex, active, sampler
@@ -204,7 +204,8 @@ class ChosenVertex:
     their own; in forward mode those of the chain, in backward mode `backward` hands them on.
 
     ray : camera rays, attached to the camera.
-    pi : what they meet.
+    first : the vertex that they meet.
+    glass : see `Vicinity`.
     """
 
     def __init__(
@@ -215,8 +216,9 @@ class ChosenVertex:
         first: Vertex,
         depths: Depths,
         mode: dr.ADMode,
+        glass: bool,
     ):
-        self.scene, self.first, self.vicinity = scene, first, Vicinity.of(first.pi)
+        self.scene, self.first, self.vicinity = scene, first, Vicinity.of(first.pi, glass)
         self.chain = Chain(scene, self.vicinity)
         found = []
 
@@ -225,7 +227,7 @@ class ChosenVertex:
                 if log is not None:
                     if self.chain.scattering.any_mirror:
                         log.leave(vertex.depth, vertex.β, numbers, active)
-                    log.arrive(vertex.depth + 1, onwards.ray, onwards.pi, onwards.mirrored, active)
+                    log.arrive(vertex.depth + 1, onwards, active)
 
             random = sampler if log is not None else sampler.clone()
             found[:] = choose_vertex(scene, random, first, depths, self.vicinity, first.pi.is_valid(), note)

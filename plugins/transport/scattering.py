@@ -22,6 +22,7 @@ class Next:
     η : relative index of refraction along the ray.
     through : mi.Bool, does the ray go on as if nothing was there?
     mirrored : mi.Bool, is its direction that of a perfect mirror, or of a smooth glass?
+    slides : mi.Bool, is its direction held, however far it is?
     moving : the same ray, as it moves with the surface; attached where wanted. Only given where the next vertex slides.
     """
 
@@ -31,6 +32,7 @@ class Next:
     η: mi.Float
     through: mi.Bool
     mirrored: mi.Bool
+    slides: mi.Bool
     moving: mi.Ray3f | None = None
 
 
@@ -185,7 +187,7 @@ class Scattering:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
         vertex. The arguments are those of `scatter`."""
         scene, context = self.scene, mi.BSDFContext()
-        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, met, lune)
+        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, vicinity, met, lune)
         ray, pi, weight, mirrored = onwards.ray, onwards.pi, onwards.weight, onwards.mirrored
         active = active & dr.any(weight != 0)
         if not self.attached:
@@ -203,7 +205,8 @@ class Scattering:
                 if vicinity is not None:
                     onwards.moving = mi.Ray3f(ray)
                     onwards.moving.o = dr.replace_grad(ray.o, si.p)
-                    scattered = self._slide(si, bsdf, bs, ray, to_y, attached, vicinity, on_surface & ~mirrored)
+                    around = vicinity.around(bsdf)
+                    scattered = self._slide(si, bsdf, bs, ray, to_y, attached, around, on_surface & ~mirrored)
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
                     turned, at_mirror = bsdf.sample(context, si, numbers.lobe, numbers.direction, active & mirrored)
@@ -297,11 +300,13 @@ def next_vertex(
     bsdf: mi.BSDFPtr,
     numbers: Numbers,
     active: mi.Bool,
+    vicinity: Vicinity | None = None,
     met: mi.PreliminaryIntersection3f | None = None,
     lune: Lune | None = None,
 ) -> tuple[mi.BSDFSample3f, Next]:
     """A direction sampled from the BSDF, and the vertex there. Detached.
 
+    vicinity : in which that slides.
     met : what the ray to it meets, if that is known.
     lune : where it is active, the direction is sampled from there. The BSDF has no perfect reflection, and lets nothing
         through.
@@ -316,7 +321,8 @@ def next_vertex(
     ray = si.spawn_ray(si.to_world(bs.wo))
     pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met
     through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
-    return bs, Next(ray, pi, weight, bs.eta, active & through, mirrored)
+    slides = mirrored if vicinity is None else mirrored | vicinity.is_infinite(bsdf)
+    return bs, Next(ray, pi, weight, bs.eta, active & through, mirrored, slides)
 
 
 def divides_by_density(bsdf: mi.BSDF) -> bool:

@@ -38,6 +38,9 @@ class PathTracer:
     integrator : tells `depths` and `hide_emitters`.
     """
 
+    #: See `Vicinity`.
+    glass = False
+
     def __init__(self, scene: mi.Scene, integrator: mi.ad.common.ADIntegrator):
         self.scene = scene
         self.depths: Depths = integrator.depths
@@ -87,7 +90,7 @@ class PathTracer:
 
         # ---------------------- Light that it scatters ----------------------
 
-        vicinity = Vicinity.of(pi) if attached and self.scatters(2) else None
+        vicinity = Vicinity.of(pi, self.glass) if attached and self.scatters(2) else None
         direct, onwards = scattering.scatter(si, bsdf, scattering.draw(sampler, active), active, vicinity, lune=lune)
         with dr.resume_grad(when=attached):
             L += direct
@@ -96,7 +99,8 @@ class PathTracer:
             return Radiance(L, valid | scattering.stops(onwards.ray, onwards.pi, sampler, active & onwards.through))
         β = dr.select(active, dr.detach(onwards.weight), 0)
         detached, η = dr.detach(mi.Ray3f(onwards.ray)), mi.Float(onwards.η)
-        second = Vertex(detached, onwards.pi, dr.full(mi.UInt32, 2, dr.width(pi.t)), β, η, onwards.mirrored)
+        two = dr.full(mi.UInt32, 2, dr.width(pi.t))
+        second = Vertex(detached, onwards.pi, two, β, η, onwards.mirrored, onwards.slides)
         if attached:
             with dr.resume_grad():
                 start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight))
@@ -137,7 +141,7 @@ class PathTracer:
             still = Vicinity(mi.Float(0))
             return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0)), None
         depths = replace(self.depths, max_depth=self.depths.max_depth - beyond)
-        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode)
+        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass)
         return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.since < c.depth, c.vicinity, c.density), c
 
     def scattered(self, ray, pi, depth, sampler, active) -> mi.Spectrum:
@@ -145,12 +149,13 @@ class PathTracer:
 
         ray, pi : the ray and what it meets. sampler : for the paths beyond. active : mi.Bool, (N,)
         """
-        one = dr.full(mi.Spectrum, 1, dr.width(active))
-        beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), mi.Bool(False))
+        one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
+        beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
         return scattered_light(self.scene, sampler, beyond, self.depths, active)[0]
 
 
 def _camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
-    one = dr.full(mi.UInt32, 1, dr.width(pi.t))
-    β = dr.full(mi.Spectrum, 1, dr.width(one))
-    return Vertex(dr.detach(mi.Ray3f(ray)), pi, one, β, mi.Float(1), dr.full(mi.Bool, False, dr.width(one)))
+    width = dr.width(pi.t)
+    one, β = dr.full(mi.UInt32, 1, width), dr.full(mi.Spectrum, 1, width)
+    no = dr.full(mi.Bool, False, width)
+    return Vertex(dr.detach(mi.Ray3f(ray)), pi, one, β, mi.Float(1), no, mi.Bool(no))
