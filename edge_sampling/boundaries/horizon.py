@@ -227,7 +227,20 @@ def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -
     cos = dr.dot(si.sh_frame.n, to_viewer)
     there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o)
     turn = there & si.is_valid() & (horizon.side != 0) & (horizon.on_curve | (horizon.side * cos <= 0))
-    n = dr.normalize(si.sh_frame.n + (horizon.side * BESIDE_HORIZON - cos) * to_viewer)
-    si.sh_frame.n = dr.select(turn, n, si.sh_frame.n)
+    _turn(si, to_viewer, horizon.side, turn)
+
+
+def turn_to_viewer(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> None:
+    """Turn interpolated normals that face away from the viewer, though their faces do not: as at the horizon."""
+    to_viewer = -ray.d
+    cos = dr.dot(si.sh_frame.n, to_viewer)
+    side = dr.sign(dr.dot(si.n, to_viewer) * dr.dot(si.n, si.sh_frame.n))
+    _turn(si, to_viewer, side, active & si.is_valid() & (side * cos <= 0))
+
+
+def _turn(si: mi.SurfaceInteraction3f, to_viewer: mi.Vector3f, side: mi.Float, active: mi.Bool) -> None:
+    """Turn interpolated normals just to a side of the horizon, see `Horizon`."""
+    n = dr.normalize(si.sh_frame.n + (side * BESIDE_HORIZON - dr.dot(si.sh_frame.n, to_viewer)) * to_viewer)
+    si.sh_frame.n = dr.select(active, n, si.sh_frame.n)
     si.initialize_sh_frame()
-    si.wi = dr.select(turn, si.to_local(to_viewer), si.wi)
+    si.wi = dr.select(active, si.to_local(to_viewer), si.wi)

@@ -26,6 +26,7 @@ from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic, 
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Lobe, View
 from rimlight.edge_sampling.geometry.device_edges import beside_edge
+from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals
 from rimlight.edge_sampling.parametrisation import Vicinity, material_point
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
@@ -53,7 +54,7 @@ class ShadingBoundary:
         edges matter at all points.
     """
 
-    _NUMBERS = ("transmits", "glossy", "emission", "emission_at_first", "several")
+    _NUMBERS = ("transmits", "glossy", "smooth", "emission", "emission_at_first", "several")
     _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
@@ -73,6 +74,8 @@ class ShadingBoundary:
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
         self.glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
+        #: Are there interpolated normals?
+        self.smooth = any(has_interpolated_normals(m) for m in geometry.meshes)
         #: Emitters of several lights (see `Lights`): only their background counts.
         self.several = [e for e in emitters if hasattr(e, "light_count")]
         #: Is emitted light sought at points that the camera sees, too? For diffuse surfaces `ShadowBoundary` is enough,
@@ -249,11 +252,13 @@ class ShadingBoundary:
             if tracer.scatters(2):
                 again = sampler.clone()
                 reflected = valid & ~emission
-                L += dr.select(reflected, tracer.scattered(ray, pi, point.depth, sampler, reflected), 0)
+                beside = ~past if self.smooth else None
+                L += dr.select(reflected, tracer.scattered(ray, pi, point.depth, sampler, reflected, beside), 0)
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
                 other_ray, other_pi, _, hidden, own = look(-side, active & ~emission & (near > 0), slack=2)
                 reflected = active & ~emission & (near > 0) & ~hidden & own
-                other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected)
+                beside = reflected if self.smooth else None
+                other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected, beside)
                 # What its own faces show, held in its direction in the vicinity.
                 faces = dr.select(reflected, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)

@@ -62,5 +62,9 @@ class Tracer(Protocol):
         depth: mi.UInt32,
         sampler: mi.Sampler,
         active: mi.Bool,
+        beside_outline: mi.Bool | None = None,
     ) -> mi.Spectrum:
-        """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`."""
+        """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`.
+
+        beside_outline : is it met just inside of its outline? Then interpolated normals that face away are turned.
+        """

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
 from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .scattering import Next, Numbers, Scattering, next_vertex
@@ -47,9 +48,16 @@ class Depths:
 
 
 def scattered_light(
-    scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, depths: Depths, active: mi.Bool
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    vertex: Vertex,
+    depths: Depths,
+    active: mi.Bool,
+    beside_outline: mi.Bool | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
+
+    beside_outline : is this vertex just inside of an outline? Then its interpolated normal, if it faces away, is turned.
 
     Returns
     -------
@@ -58,9 +66,12 @@ def scattered_light(
         nothing was there?
     """
     scattering = Scattering(scene, attached=False)
+    first = mi.UInt32(vertex.depth)
 
     def bounce(L, stopped, vertex, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
+        if beside_outline is not None:
+            turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
         direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), scattering.draw(sampler, active), active)
         L += dr.select(active, vertex.β * direct, 0)
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)

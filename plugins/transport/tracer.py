@@ -144,14 +144,15 @@ class PathTracer:
         c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass)
         return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.since < c.depth, c.vicinity, c.density), c
 
-    def scattered(self, ray, pi, depth, sampler, active) -> mi.Spectrum:
+    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`. Detached.
 
         ray, pi : the ray and what it meets. sampler : for the paths beyond. active : mi.Bool, (N,)
+        beside_outline : mi.Bool, (N,), is it met just inside of its outline?
         """
         one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
-        return scattered_light(self.scene, sampler, beyond, self.depths, active)[0]
+        return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline)[0]
 
 
 def _camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
