@@ -15,7 +15,7 @@ from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
 
 from .horizon import HorizonPoint, Horizons
-from .lune import Lune
+from .lune import Lune, spreads
 
 #: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
 #: an edge that cannot be seen changes nothing, not even the last bit.
@@ -91,8 +91,8 @@ class FilmOutlines:
         self.edges = DeviceEdges(edges) if len(edges) else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
         #: Which edges are on meshes that reflect light from all directions, but from behind?
-        spreads = np.array([_spreads(m.bsdf()) for m in geometry.meshes])
-        self.spreads = mi.Bool(spreads[edges.mesh[:, 0]]) if len(edges) else None
+        spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes])
+        self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
         shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
         shapes = tuple(s for s, moves in shapes if moves)
         self.curves = Curves(shapes) if shapes else None
@@ -283,8 +283,3 @@ class FilmOutlines:
             t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)
             points.append(dr.select(crossed, dr.lerp(corners[0], corners[k], t), dr.nan))
         return points[0], points[1]
-
-
-def _spreads(bsdf: mi.BSDF | None) -> bool:
-    """Does it reflect light from all directions, and let none through?"""
-    return bsdf is not None and not bsdf.flags() & (mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+
+
+def spreads(bsdf: mi.BSDF | mi.BSDFPtr) -> mi.Bool | bool:
+    """Does it reflect light from all directions, and let none through? Only then may light be sampled in a lune."""
+    return (bsdf.flags() & (mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)) == 0
 
 
 @dataclass(frozen=True)
@@ -37,10 +42,25 @@ class Lune:
         towards = dr.cross(first, axis)
         return Lune(axis, towards, first, dr.atan2(-dr.dot(second, towards), dr.dot(second, first)), active)
 
+    def where(self, active: mi.Bool) -> Lune:
+        """The same, active at most there."""
+        return replace(self, active=self.active & active)
+
     def sample(self, side: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         """A direction, uniform by solid angle, and its density. side, u : uniform random numbers."""
         s, c = dr.sincos(self.angle * u.x)
         along = 2 * u.y - 1
         across = dr.mulsign(dr.safe_sqrt(1 - dr.square(along)), side - 0.5)
         direction = along * self.axis + across * (c * self.towards + s * self.normal)
-        return direction, dr.rcp(4 * dr.abs(self.angle))
+        return direction, self._density
+
+    def pdf(self, direction: mi.Vector3f) -> mi.Float:
+        """The density with which `sample` draws a direction."""
+        s, c = dr.sincos(self.angle)
+        first = dr.dot(direction, self.normal)
+        second = c * first - s * dr.dot(direction, self.towards)
+        return dr.select((first > 0) != (second > 0), self._density, 0)
+
+    @property
+    def _density(self) -> mi.Float:
+        return dr.rcp(4 * dr.abs(self.angle))

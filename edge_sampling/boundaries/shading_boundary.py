@@ -31,6 +31,7 @@ from rimlight.edge_sampling.parametrisation import Vicinity, material_point
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .indirect_shadows import is_bent, share
+from .lune import Lune, spreads
 from .tracer import ShadingPoint, Tracer
 
 #: Directions that are sampled from a BSDF, to find its peak.
@@ -54,7 +55,7 @@ class ShadingBoundary:
         edges matter at all points.
     """
 
-    _NUMBERS = ("transmits", "glossy", "smooth", "emission", "emission_at_first", "several")
+    _NUMBERS = ("transmits", "glossy", "smooth", "soft", "emission", "emission_at_first", "several")
     _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
@@ -76,6 +77,8 @@ class ShadingBoundary:
         self.glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
         #: Are there interpolated normals?
         self.smooth = any(has_interpolated_normals(m) for m in geometry.meshes)
+        #: Have all lights a size? Then what the planes of faces hide has one, too.
+        self.soft = len(lights) == len(emitters)
         #: Emitters of several lights (see `Lights`): only their background counts.
         self.several = [e for e in emitters if hasattr(e, "light_count")]
         #: Is emitted light sought at points that the camera sees, too? For diffuse surfaces `ShadowBoundary` is enough,
@@ -158,7 +161,8 @@ class ShadingBoundary:
                 f = bsdf.eval(mi.BSDFContext(), si, si.to_local(dr.normalize(d)), active)
                 arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
                 seen_past = outline.outward(dr.cross(d, outline.tangent)) != 0
-                return dr.max(f) * arc * dr.select(seen_past, 1, 1 - vicinity.far(r2))
+                crease = self.silhouettes.crease(e, outline) * (1 - vicinity.far(r2))
+                return dr.max(f) * arc * dr.select(seen_past, 1, crease)
 
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
             e.density *= dr.select(emission, p / lights, 1 - p)
@@ -252,13 +256,19 @@ class ShadingBoundary:
             if tracer.scatters(2):
                 again = sampler.clone()
                 reflected = valid & ~emission
-                beside = ~past if self.smooth else None
-                L += dr.select(reflected, tracer.scattered(ray, pi, point.depth, sampler, reflected, beside), 0)
+                beside, lune = None, None
+                if self.smooth:
+                    # Where only the planes of its faces hide something, light comes from between them.
+                    beside = ~past
+                    soft = beside & self.silhouettes.only_bends(sample) & spreads(y.bsdf()) & self.soft
+                    lune = Lune.between(outline.tangent, outline.normals, soft)
+                scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune)
+                L += dr.select(reflected, scattered, 0)
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
                 other_ray, other_pi, _, hidden, own = look(-side, active & ~emission & (near > 0), slack=2)
                 reflected = active & ~emission & (near > 0) & ~hidden & own
                 beside = reflected if self.smooth else None
-                other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected, beside)
+                other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected, beside, lune)
                 # What its own faces show, held in its direction in the vicinity.
                 faces = dr.select(reflected, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)

@@ -63,8 +63,10 @@ class Tracer(Protocol):
         sampler: mi.Sampler,
         active: mi.Bool,
         beside_outline: mi.Bool | None = None,
+        lune: Lune | None = None,
     ) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`.
 
         beside_outline : is it met just inside of its outline? Then interpolated normals that face away are turned.
+        lune : where it is active, only light from there need be scattered.
         """

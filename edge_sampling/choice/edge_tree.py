@@ -194,8 +194,9 @@ class EdgeTree:
             planes[k] = dr.select(always, mi.Vector4f(0, 0, 0, d), planes[k])
         usable = self._used & dr.isfinite(dr.squared_norm(a)) & dr.isfinite(dr.squared_norm(b))
         a, b = dr.select(usable, a, 0), dr.select(usable, b, 0)
-        crease = usable & ~always & device_edges.is_crease(edge, dr.norm(dr.cross(flat[0], flat[1])))
-        return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), mi.Float(always & usable), mi.Float(crease))
+        crease = device_edges.crease(edge, dr.norm(dr.cross(flat[0], flat[1])))
+        crease = dr.select(usable & ~always, crease, 0)
+        return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), mi.Float(always & usable), crease)
 
     def _leaf(self, first: mi.UInt32) -> Node:
         nodes = [self._single(self.slot(first + k)) for k in range(LEAF)]

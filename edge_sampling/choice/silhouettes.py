@@ -45,6 +45,11 @@ class OutlinePoint:
     tangent: mi.Vector3f
     inwards: tuple[mi.Vector3f, mi.Vector3f]
 
+    @property
+    def normals(self) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Normals of the faces on both sides of an edge: of equal sense, not normalised."""
+        return dr.cross(self.tangent, self.inwards[0]), dr.cross(self.inwards[1], self.tangent)
+
     def outward(self, across: mi.Vector3f) -> mi.Float:
         """The side of a silhouette on which its faces are not: the sign of `across`, (N,); 0 where they are on both.
 
@@ -163,6 +168,20 @@ class Silhouettes:
     @staticmethod
     def _far(view: View) -> mi.Bool:
         return mi.Bool(False) if view.far is None else view.far
+
+    def crease(self, sample: EdgeSample, outline: OutlinePoint) -> mi.Float:
+        """About how much jumps at a point if both faces are seen, see `DeviceEdges.crease`."""
+        if self.tree is None:
+            return mi.Float(0)
+        first, second = (dr.normalize(n) for n in outline.normals)
+        edge = dr.select(sample.edge < self.count, sample.edge, 0)
+        return self.tree.device_edges.crease(edge, dr.norm(dr.cross(first, second)))
+
+    def only_bends(self, sample: EdgeSample) -> mi.Bool:
+        """Is it on an edge across which nothing differs but the planes of two smooth-shaded faces?"""
+        if self.tree is None:
+            return mi.Bool(False)
+        return (sample.edge < self.count) & self.tree.device_edges.is_smooth(dr.minimum(sample.edge, self.count - 1))
 
     def point(
         self, placement: Placement, sample: EdgeSample, eye: mi.Point3f, far: mi.Bool | bool = False

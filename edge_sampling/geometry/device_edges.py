@@ -115,12 +115,20 @@ class DeviceEdges:
         sine = dr.norm(dr.cross(first, second))
         return dr.select(dr.gather(mi.Bool, self._two_faces, edge) & (sine > COPLANAR), dr.square(sine), 0)
 
-    def is_crease(self, edge: mi.UInt32, sine: mi.Float) -> mi.Bool:
-        """May what is seen jump across an edge, though both of its faces are? Then something else than their shape
-        differs, or the normals that shade do. sine : of the angle between the normals of the faces."""
+    def is_smooth(self, edge: mi.UInt32) -> mi.Bool:
+        """Are interpolated normals, and all else, the same on both sides?"""
+        return dr.gather(mi.UInt32, self._kind, edge) == int(EdgeKind.SMOOTH)
+
+    def crease(self, edge: mi.UInt32, sine: mi.Float) -> mi.Float:
+        """About how much what is seen jumps across an edge, though both of its faces are seen: 1 if something else than
+        their shape differs, or the normals that shade do; if only their planes do, as `bend`.
+
+        sine : of the angle between the normals of the faces.
+        """
         kind = dr.gather(mi.UInt32, self._kind, edge)
-        found = (kind == int(EdgeKind.JUMP)) | (kind == int(EdgeKind.SPLIT))
-        return found | ((kind == int(EdgeKind.FLAT)) & (sine > COPLANAR))
+        other = (kind == int(EdgeKind.JUMP)) | (kind == int(EdgeKind.SPLIT))
+        bent = dr.select(kind == int(EdgeKind.FLAT), 1, dr.square(sine))
+        return dr.select(other, 1, dr.select(sine > COPLANAR, bent, 0))
 
     def is_silhouette_of_any(self, positions: mi.Float, edge: mi.UInt32, places: mi.Vector4f) -> mi.Bool:
         """Is the edge a silhouette as seen from one of the `places`, see `Lights.places`? Detached."""

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
+from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .scattering import Next, Numbers, Scattering, next_vertex
@@ -54,10 +55,12 @@ def scattered_light(
     depths: Depths,
     active: mi.Bool,
     beside_outline: mi.Bool | None = None,
+    lune: Lune | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
-    beside_outline : is this vertex just inside of an outline? Then its interpolated normal, if it faces away, is turned.
+    beside_outline : is this vertex just inside of an outline? Then interpolated normals that face away are turned.
+    lune : see `Scattering.scatter`, for this vertex.
 
     Returns
     -------
@@ -72,7 +75,9 @@ def scattered_light(
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         if beside_outline is not None:
             turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
-        direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), scattering.draw(sampler, active), active)
+        from_lune = lune.where(active & (vertex.depth == first)) if lune is not None else None
+        numbers = scattering.draw(sampler, active)
+        direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), numbers, active, lune=from_lune)
         L += dr.select(active, vertex.β * direct, 0)
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)
         stopped |= (active & ~onwards.through) | scattering.stops(onwards.ray, onwards.pi, sampler, last)

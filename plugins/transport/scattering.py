@@ -97,20 +97,20 @@ class Scattering:
 
         vicinity : in which that slides; None: it is a material point.
         met : what the ray to it meets, if that is known.
-        lune : where it is active, only light from there is reflected. Only where no gradients are carried.
+        lune : where it is active, directions are sampled from there in place of the BSDF. Of what comes from elsewhere,
+            only a part is found then. Only where no gradients are carried.
         """
-        by_light = active if lune is None else active & ~lune.active
-        from_emitter = self.sample_emitter(si, bsdf, numbers.light, by_light) if self.any else 0
+        from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, lune) if self.any else 0
         from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met, lune)
         with dr.resume_grad(when=self.attached):
             return from_bsdf + from_emitter, onwards
 
-    def sample_emitter(self, si, bsdf, sample: mi.Point2f, active):
-        """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,)."""
+    def sample_emitter(self, si, bsdf, sample: mi.Point2f, active, lune: Lune | None = None):
+        """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). lune : see `scatter`."""
         towards_light = lambda active: self.scene.sample_emitter_direction(si, sample, False, active)
-        return self.reflect(si, bsdf, towards_light, active)
+        return self.reflect(si, bsdf, towards_light, active, lune)
 
-    def reflect(self, si, bsdf, towards_light, active):
+    def reflect(self, si, bsdf, towards_light, active, lune: Lune | None = None):
         """Radiance reflected at `si` by what `towards_light` samples: mi.Spectrum, (N,).
 
         towards_light : maps `active` to a direction and the light from there over its density, as Mitsuba's
@@ -126,6 +126,8 @@ class Scattering:
             active &= visible
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
+            if lune is not None:
+                pdf = dr.select(lune.active, lune.pdf(direction), pdf)
             mis = power_heuristic(ds.pdf, pdf)
             if len(self.held.smooth_lamps) and to_lamp is not None:
                 mis = to_lamp.attach(mis, ds.pdf, pdf, by_light=True)
@@ -232,9 +234,8 @@ class Scattering:
             if len(self.held.smooth_lamps) and self.attached:
                 bsdf_pdf = bsdf.pdf(context, si, si.to_local(ω), active & ~mirrored)
                 mis = to_y.attach(mis, bsdf_pdf, pdf, by_light=False)
-            alone = mirrored if lune is None else mirrored | lune.active
-            mis = dr.select(alone, 1, mis)
-            Le = dr.select(active, weight * self._emission(emitter, y, alone, active) * mis, 0)
+            mis = dr.select(mirrored, 1, mis)
+            Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
         return Le, onwards
 
     @staticmethod
@@ -284,9 +285,9 @@ class Scattering:
             found |= several.of_light(ds)
         return found
 
-    def _emission(self, emitter, y, alone, active) -> mi.Spectrum:
-        """What the BSDF sample sees at y. alone : no light sample can see it."""
-        without = active & self._of_several(emitter) & ~alone
+    def _emission(self, emitter, y, mirrored, active) -> mi.Spectrum:
+        """What the BSDF sample sees at y."""
+        without = active & self._of_several(emitter) & ~mirrored
         L = emitter.eval(y, active & ~without)
         for several in self.several:
             mine = without & (emitter == mi.EmitterPtr(several))

@@ -66,7 +66,7 @@ class PathTracer:
         """Estimate the radiance along camera rays.
 
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
-        lune : from where that reflects light, where it is active; lights without a size are left out there.
+        lune : see `Scattering.scatter`, for the first hit.
         """
         scene = self.scene
         active = active & (self.depths.max_depth > 0)
@@ -144,15 +144,16 @@ class PathTracer:
         c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass)
         return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.since < c.depth, c.vicinity, c.density), c
 
-    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None) -> mi.Spectrum:
+    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None, lune=None) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`. Detached.
 
         ray, pi : the ray and what it meets. sampler : for the paths beyond. active : mi.Bool, (N,)
         beside_outline : mi.Bool, (N,), is it met just inside of its outline?
+        lune : see `Scattering.scatter`, for what the ray meets.
         """
         one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
-        return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline)[0]
+        return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline, lune)[0]
 
 
 def _camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
