@@ -225,6 +225,24 @@ MUTANTS = [
         "near = 1 - vicinity.far(dr.square(dr.detach(along)))",
     ),
     mutant(
+        "vicinity: normals that face away stay so just inside of an outline",
+        "plugins/transport/paths.py",
+        "turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))",
+        "turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth < first))",
+    ),
+    mutant(
+        "vicinity: edges behind rough glass count on one side",
+        SHADING,
+        "point.vicinity.around(bsdf).radius",
+        "point.vicinity.radius",
+    ),
+    mutant(
+        "film boundary: light from one of two lunes",
+        "edge_sampling/boundaries/lune.py",
+        "dr.mulsign(dr.safe_sqrt(1 - dr.square(along)), side - 0.5)",
+        "dr.safe_sqrt(1 - dr.square(along))",
+    ),
+    mutant(
         "edges from points: only what is seen past silhouettes counts",
         SHADING,
         "return value + faces * edge if tracer.scatters(2) else value",
