@@ -20,7 +20,7 @@ from rimlight.edge_sampling import (
     objects_below,
     t_junctions,
 )
-from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, vertices
+from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, has_normal_map, is_smooth, vertices
 from rimlight.transport.paths import Depths
 
 #: What perfect mirrors and glass do.
@@ -131,6 +131,12 @@ def appearance(scene: mi.Scene, moving: Moving) -> list[str]:
         limits.append(
             f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
             "normal maps for bump maps."
+        )
+    curved = names(s for s in moving.on_film if has_normal_map(s) and (not s.is_mesh() or is_smooth(s)))
+    if curved:
+        limits.append(
+            f"the derivative is off by some per cent at the outlines of {', '.join(curved)}: the normals of a normal "
+            "map turn away from the sensor along lines inside of faces, whose jumps are not sampled."
         )
     if (moving.camera or moving.lights) and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
         limits.append(
