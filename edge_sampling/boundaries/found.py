@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.choice.silhouettes import Silhouettes
 
 from .face_planes import FacePlanes
@@ -17,7 +18,7 @@ from .shadow_boundary import ShadowBoundary
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
     does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see
-    `Vicinity`."""
+    `Vicinity`. `lights` : chooses one, where there are many."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -29,6 +30,7 @@ class Boundaries:
     lights_move: bool = False
     limits: tuple[str, ...] = ()
     glass: bool = False
+    lights: LightChoice | None = None
 
     @property
     def silhouettes(self) -> Silhouettes | None:
@@ -42,5 +44,7 @@ class Boundaries:
         """Follow the vertices. To be called before sampling."""
         if self.silhouettes is not None:
             self.silhouettes.refit()
+        if self.lights is not None:
+            self.lights.refit()
         if self.shading is not None:
             self.shading.refit()

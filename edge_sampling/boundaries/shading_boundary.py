@@ -126,14 +126,14 @@ class ShadingBoundary:
             # Emitted light is sought in the directions of one light, scattered light everywhere.
             p = dr.select(emission, dr.select(scattering, EMISSION, 1), 0)
             emission = sampler.next_1d(active) < p
-            light, lights = self._choose(self.lights, sampler, active)
+            facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
+            light, p_light = self._choose(tracer, si.p, facing, sampler, active)
             cone = self.boxes.cone(light, si.p)
             cone.cos = dr.select(emission, cone.cos, -1)
             light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), light, active)
 
             # ---------------------- An edge ----------------------
 
-            facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
             view = View(
                 mi.Vector3f(si.p - self.silhouettes.centre),
                 facing,
@@ -165,7 +165,7 @@ class ShadingBoundary:
                 return dr.max(f) * arc * dr.select(seen_past, 1, crease)
 
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
-            e.density *= dr.select(emission, p / lights, 1 - p)
+            e.density *= dr.select(emission, p * p_light, 1 - p)
         return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, vicinity)
 
     @staticmethod
@@ -190,12 +190,14 @@ class ShadingBoundary:
         # As wide as a lobe of that density.
         return Lobe(si.to_world(axis), pdf, dr.clip(dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-3)), 1e-5, 1))
 
-    @staticmethod
-    def _choose(lights: mi.UInt32, sampler: mi.Sampler, active: mi.Bool | bool) -> tuple[mi.UInt32, int]:
-        """One of the lights, and how many there are."""
-        count = dr.width(lights)
+    def _choose(self, tracer: Tracer, x, facing, sampler: mi.Sampler, active) -> tuple[mi.UInt32, mi.Float | float]:
+        """One of the lights with a size, by its number in the scene, and with which probability."""
+        count = dr.width(self.lights)
+        if tracer.lights is not None and tracer.lights.count == count:
+            chosen = tracer.lights.choose(dr.detach(x), mi.Vector3f(facing), sampler.next_1d(active), active)
+            return chosen.number, chosen.p
         which = dr.minimum(mi.UInt32(sampler.next_1d(active) * count), count - 1) if count > 1 else mi.UInt32(0)
-        return dr.gather(mi.UInt32, lights, which), count
+        return dr.gather(mi.UInt32, self.lights, which), 1 / count
 
     def _evaluate(
         self,

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import mitsuba as mi
 
+from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .horizon import Horizon
@@ -39,9 +40,11 @@ class Tracer(Protocol):
     """Traces paths in a scene. All that is returned is detached.
 
     scene : mi.Scene
+    lights : chooses one of many lights; None: all are equally likely.
     """
 
     scene: mi.Scene
+    lights: LightChoice | None
 
     def scatters(self, depth: mi.UInt32 | int) -> mi.Bool | bool:
         """May a vertex of this number reflect direct light?"""

@@ -52,7 +52,7 @@ class LightByLight(Scattering):
         with dr.resume_grad(when=self.attached):
             return L if self.count == len(self.lights) else L * (len(self.lights) / self.count)
 
-    def pdf_direction(self, si, ds, active) -> mi.Float:
+    def pdf_direction(self, si, ds, active, chosen) -> mi.Float:
         return ds.emitter.pdf_direction(si, ds, active)
 
     def number(self, emitter: mi.EmitterPtr) -> mi.UInt32:

@@ -23,6 +23,7 @@ from rimlight.edge_sampling import (
     find_welded_edges,
 )
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.transport.paths import Depths
 
@@ -149,7 +150,7 @@ class BoundarySearch:
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass)
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, LightChoice.of(scene))
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int

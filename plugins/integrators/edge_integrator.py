@@ -187,7 +187,7 @@ class EdgeIntegrator(ADIntegrator):
         boundaries = self._boundaries(scene, sensor, counts.shading)
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
         tracer = self.TRACER(scene, self)
-        tracer.glass = boundaries.glass
+        tracer.glass, tracer.lights = boundaries.glass, boundaries.lights
         return Job(tracer, sensor, boundaries, counts, rays, seed, mode)
 
     @no_collection()

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
 from rimlight.edge_sampling.boundaries.lune import Lune
+from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .scattering import Next, Numbers, Scattering, next_vertex
@@ -56,11 +57,13 @@ def scattered_light(
     active: mi.Bool,
     beside_outline: mi.Bool | None = None,
     lune: Lune | None = None,
+    lights: LightChoice | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
     beside_outline : is this vertex just inside of an outline? Then interpolated normals that face away are turned.
     lune : see `Scattering.scatter`, for this vertex.
+    lights : see `Scattering`.
 
     Returns
     -------
@@ -68,7 +71,7 @@ def scattered_light(
     stopped : mi.Bool, (N,), does the path meet, there or farther on, a surface that it does not go through as if
         nothing was there?
     """
-    scattering = Scattering(scene, attached=False)
+    scattering = Scattering(scene, attached=False, lights=lights)
     first = mi.UInt32(vertex.depth)
 
     def bounce(L, stopped, vertex, active, sampler):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
 
 from .log import Log
@@ -40,10 +41,11 @@ class Chain:
     """The vertices of paths behind the first, as they move.
 
     vicinity : in which they slide.
+    lights : see `Scattering`.
     """
 
-    def __init__(self, scene: mi.Scene, vicinity: Vicinity):
-        self.scattering = Scattering(scene, attached=True)
+    def __init__(self, scene: mi.Scene, vicinity: Vicinity, lights: LightChoice | None = None):
+        self.scattering = Scattering(scene, attached=True, lights=lights)
         self.vicinity = vicinity
 
     def surface(self, vertex: Vertex, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -105,9 +107,10 @@ class Replay:
         vicinity: Vicinity,
         depths: Depths,
         active: mi.Bool,
+        lights: LightChoice | None = None,
     ):
         self.scene, self.sampler, self.vertex, self.start, self.depths = scene, sampler, vertex, start, depths
-        self.chain = Chain(scene, vicinity)
+        self.chain = Chain(scene, vicinity, lights)
         self.active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
 
     def forward(self, start: Start) -> mi.Spectrum:

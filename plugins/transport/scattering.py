@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.lune import Lune
+from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below
 from rimlight.edge_sampling.parametrisation import Parametrisation, Vicinity, shown_by_mirror
@@ -58,10 +59,11 @@ class Scattering:
     cancel.
 
     attached : carry gradients? Otherwise values only.
+    lights : chooses one of many lights; None: Mitsuba does.
     """
 
-    def __init__(self, scene: mi.Scene, *, attached: bool):
-        self.scene = scene
+    def __init__(self, scene: mi.Scene, *, attached: bool, lights: LightChoice | None = None):
+        self.scene, self.lights = scene, lights
         self.attached = attached
         flags = [e.flags() for e in scene.emitters()]
         self.any = bool(flags)
@@ -78,6 +80,7 @@ class Scattering:
         self.by_density = [mi.BSDFPtr(s.bsdf()) for s in scene.shapes() if s.bsdf() and divides_by_density(s.bsdf())]
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
+        self.transmits = any(f & mi.BSDFFlags.Transmission for f in bsdfs)
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Numbers:
         light = sampler.next_2d(active) if self.any else mi.Point2f(0)
@@ -100,14 +103,32 @@ class Scattering:
         lune : where it is active, directions are sampled from there in place of the BSDF. Of what comes from elsewhere,
             only a part is found then. Only where no gradients are carried.
         """
-        from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, lune) if self.any else 0
-        from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met, lune)
+        chosen = self._choose(si, numbers, active)
+        from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, lune, chosen) if self.any else 0
+        from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met, lune, chosen)
         with dr.resume_grad(when=self.attached):
             return from_bsdf + from_emitter, onwards
 
-    def sample_emitter(self, si, bsdf, sample: mi.Point2f, active, lune: Lune | None = None):
-        """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). lune : see `scatter`."""
-        towards_light = lambda active: self.scene.sample_emitter_direction(si, sample, False, active)
+    def _choose(self, si, numbers: Numbers, active) -> ChosenLight | None:
+        """The light of a light sample; None: it is Mitsuba that chooses."""
+        if self.lights is None:
+            return None
+        at = dr.detach(si)
+        facing = mi.Vector3f(0) if self.transmits else at.n * dr.sign(dr.dot(at.n, at.to_world(at.wi)))
+        return self.lights.choose(at.p, mi.Vector3f(facing), numbers.light.x, active)
+
+    def sample_emitter(
+        self, si, bsdf, sample: mi.Point2f, active, lune: Lune | None = None, chosen: ChosenLight | None = None
+    ):
+        """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). lune : see `scatter`. chosen : which."""
+
+        def towards_light(active):
+            if chosen is None:
+                return self.scene.sample_emitter_direction(si, sample, False, active)
+            ds, weight = chosen.emitter.sample_direction(si, mi.Point2f(chosen.left, sample.y), active)
+            ds.pdf *= chosen.p
+            return ds, weight / chosen.p
+
         return self.reflect(si, bsdf, towards_light, active, lune)
 
     def reflect(self, si, bsdf, towards_light, active, lune: Lune | None = None):
@@ -185,9 +206,10 @@ class Scattering:
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
         lune: Lune | None = None,
+        chosen: ChosenLight | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
-        vertex. The arguments are those of `scatter`."""
+        vertex. The arguments are those of `scatter`. chosen : the light of the light sample there."""
         scene, context = self.scene, mi.BSDFContext()
         bs, onwards = next_vertex(scene, si, bsdf, numbers, active, vicinity, met, lune)
         ray, pi, weight, mirrored = onwards.ray, onwards.pi, onwards.weight, onwards.mirrored
@@ -228,7 +250,7 @@ class Scattering:
             return mi.Spectrum(0), onwards
         emitter = y.emitter(scene, active)
         ds = mi.DirectionSample3f(scene, y, si)
-        pdf = self.pdf_direction(si, ds, active & ~mirrored & (emitter != None))  # noqa: E711
+        pdf = self.pdf_direction(si, ds, active & ~mirrored & (emitter != None), chosen)  # noqa: E711
         with dr.resume_grad(when=self.attached):
             mis = power_heuristic(bs.pdf, pdf)
             if len(self.held.smooth_lamps) and self.attached:
@@ -263,9 +285,11 @@ class Scattering:
         bs, _ = si.bsdf(ray).sample(mi.BSDFContext(), si, *numbers, active)
         return active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
-    def pdf_direction(self, si, ds, active) -> mi.Float:
+    def pdf_direction(self, si, ds, active, chosen: ChosenLight | None) -> mi.Float:
         """Density with which `ds` would have been sampled as a light."""
-        return self.scene.pdf_emitter_direction(si, ds, active)
+        if chosen is None:
+            return self.scene.pdf_emitter_direction(si, ds, active)
+        return ds.emitter.pdf_direction(si, ds, active) * self.lights.probability(ds.emitter, chosen)
 
     # ---------------------- Emitters of several lights ----------------------
 

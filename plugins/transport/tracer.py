@@ -10,6 +10,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side
 from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
+from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
 
 from .paths import Depths, Vertex, scattered_light
@@ -40,6 +41,9 @@ class PathTracer:
 
     #: See `Vicinity`.
     glass = False
+
+    #: See `Scattering`.
+    lights: LightChoice | None = None
 
     def __init__(self, scene: mi.Scene, integrator: mi.ad.common.ADIntegrator):
         self.scene = scene
@@ -84,7 +88,7 @@ class PathTracer:
         bsdf = si.bsdf(ray)
         backdrop = active & (scene.environment() is not None and not self.hide_emitters)
         active &= si.is_valid()
-        scattering = Scattering(scene, attached=attached)
+        scattering = Scattering(scene, attached=attached, lights=self.lights)
         if not self.scatters(1):
             return Radiance(L, backdrop | scattering.stops(ray, pi, sampler, active))
 
@@ -104,8 +108,8 @@ class PathTracer:
         if attached:
             with dr.resume_grad():
                 start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight))
-            return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active))
-        indirect, stopped = scattered_light(scene, sampler, second, self.depths, active)
+            return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, self.lights))
+        indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, lights=self.lights)
         return Radiance(L + dr.select(β != 0, indirect, 0), valid | (onwards.through & stopped))
 
     def first_hit(self, ray: mi.Ray3f, active: mi.Bool | bool) -> mi.PreliminaryIntersection3f:
@@ -153,7 +157,7 @@ class PathTracer:
         """
         one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
-        return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline, lune)[0]
+        return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline, lune, self.lights)[0]
 
 
 def _camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
