@@ -28,7 +28,7 @@ FINITE = (
 
 #: Single pixels outweigh many others, and nobody knows a remedy yet.
 INFINITE = {
-    "bunny_box": "the film boundary between faces of a smooth mesh, in indirect light, is noise",
+    "bunny_box": "a slope of -0.35 was found: -0.31 of edges from points, -0.36 of the interior, -0.48 on the film",
     "smooth_torus_sun": "heavy tails of unknown cause: slopes of -0.07 and -0.28 were found",
     "sphere_soft": "just inside of contours, points move as one over a cosine: a slope of -0.398 was found",
 }
