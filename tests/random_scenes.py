@@ -122,11 +122,14 @@ class RandomScene:
 
 
 class Generator:
-    """Makes one scene. The same seed makes the same one, but for the sampler of its sensor."""
+    """Makes one scene. The same seed makes the same one, but for the sampler of its sensor.
 
-    def __init__(self, seed: int, sampler: str):
+    home : at the origin, and one scene unit large, whatever size and place the seed says? The image is the same.
+    """
+
+    def __init__(self, seed: int, sampler: str, home: bool = False):
         self.rng = np.random.default_rng([seed, 14])
-        self.sampler = sampler
+        self.sampler, self.home = sampler, home
         self.objects: dict[str, Any] = {"type": "scene"}
         self.labels: list[str] = []
         self.lights: list[np.ndarray] = []
@@ -160,6 +163,8 @@ class Generator:
         self.scale = self.pick(1.0, 1.0, 1.0, 1.0, 1e-3, 1e-2, 30.0, 1e4)
         self.origin = self.direction() * self.scale * self.pick(0, 0, 0, 3, 20)
         self.labels.append(f"x{self.scale:g}" + (f"@{np.linalg.norm(self.origin):g}" if self.origin.any() else ""))
+        if self.home:
+            self.scale, self.origin = 1.0, np.zeros(3)
         # What moves must not show instances, whose outlines are unknown: no sky, no gloss, no interreflections.
         self.instances = self.chance(0.06)
         direct = self.chance(0.6) or self.instances
@@ -531,8 +536,8 @@ class Generator:
         return change
 
 
-def make(seed: int, sampler: str = "independent") -> RandomScene:
-    return Generator(seed, sampler).make()
+def make(seed: int, sampler: str = "independent", home: bool = False) -> RandomScene:
+    return Generator(seed, sampler, home).make()
 
 
 # ---------------------- Comparison ----------------------
@@ -623,7 +628,8 @@ def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES) -> Comparis
     """Compare a scene's derivative with finite differences, with more samples until the answer is clear."""
     start, row = time.time(), Comparison(seed, "")
     try:
-        still, moving = make(seed, "multijitter"), make(seed)
+        # Finite differences at the origin, where rays start close to surfaces, and single precision tells most.
+        still, moving = make(seed, "multijitter", home=True), make(seed)
         row.label = still.label
         path = mi.load_dict({"type": "path", "max_depth": still.max_depth, "rr_depth": 1000})
         integrator = mi.load_dict(moving.integrator)

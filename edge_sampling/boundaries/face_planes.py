@@ -22,6 +22,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth
 from rimlight.edge_sampling.parametrisation import material_point
+from rimlight.edge_sampling.rays import spawn_ray
 
 from .tracer import ShadingPoint, Tracer
 
@@ -53,7 +54,7 @@ class FacePlanes:
             active = active & ours & at.is_valid()
             sides = []
             for side in (1, -1):
-                ray = at.spawn_ray(dr.normalize(ω + side * BESIDE_PLANE * at.n))
+                ray = spawn_ray(scene, at, dr.normalize(ω + side * BESIDE_PLANE * at.n))
                 # (Mitsuba's `normalmap` reflects nothing that arrives from behind the face.)
                 F = dr.two_pi * at.bsdf().eval(mi.BSDFContext(), at, at.to_local(ray.d), active)
                 reflects = active & dr.any(F != 0)

@@ -24,13 +24,14 @@ from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
+from rimlight.edge_sampling.rays import lift
 
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
 from .lune import Lune
 from .tracer import Tracer
 
-#: How far beside the edges of meshes that light goes through to look, in units of the offset of Mitsuba's rays.
+#: How far beside the edges of meshes that light goes through to look, in units of the offset of rays that start there.
 BEHIND = 8
 
 
@@ -177,7 +178,7 @@ class FilmBoundary:
                 n_dl = dr.select(chosen.is_horizon, dr.mulsign(n_dl, dr.dot(n_dl, found.facing)), n_dl)
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
-            offset = self._offset(at.projection, p, chosen.index) * dr.normalize(n_dl)
+            offset = self._offset(scene, at.projection, p, chosen.index) * dr.normalize(n_dl)
             rays, weights = _beside(at, sensor, sampler, u, offset, active)
             active = self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, active)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
@@ -220,14 +221,14 @@ class FilmBoundary:
             side = dr.select(chosen.is_edge & self.outlines.edges.is_fold(at.positions, chosen.edge, p, sight), side, 0)
         return [Horizon(dr.select(chosen.is_horizon, mi.Float(sign), side), p, chosen.is_horizon) for sign in (-1, 1)]
 
-    def _offset(self, projection: Projection, p: mi.Point3f, index: mi.UInt32) -> mi.Float:
+    def _offset(self, scene: mi.Scene, projection: Projection, p: mi.Point3f, index: mi.UInt32) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart."""
         ulp = dr.epsilon(mi.Float) * 2
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = 8 * ulp * largest
         if self.transmit is not None:
-            # Mitsuba's rays start so far from a surface: beside the edge of glass, beyond the face on the other side.
-            behind = BEHIND * mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+            # Rays start so far from a surface: beside the edge of glass, beyond the face on the other side.
+            behind = BEHIND * lift(scene, p)
             in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind, 0)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)

@@ -20,6 +20,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.choice.silhouettes import Placement
 from rimlight.edge_sampling.geometry.meshes import is_smooth
 from rimlight.edge_sampling.parametrisation import material_point
+from rimlight.edge_sampling.rays import spawn_ray_to
 
 from .shadow_boundary import SeenShadow, ShadowBoundary, fall, thrown
 from .tracer import ShadingPoint, Tracer
@@ -72,7 +73,7 @@ class IndirectShadows(ShadowBoundary):
             si.wavelengths = z.wavelengths
             f, pdf = z.bsdf().eval_pdf(mi.BSDFContext(), z, z.to_local(ω), active)
             active &= dr.any(f != 0)
-            active &= ~scene.ray_test(z.spawn_ray_to(si.p), active)
+            active &= ~scene.ray_test(spawn_ray_to(scene, z, si.p), active)
             cos_over_r2 = dr.abs_dot(si.n, ω) / r2
             ours = dr.select(light.on_surface, share(point, pdf * cos_over_r2), 1)
             ray = mi.RayDifferential3f(shadow.ray)

@@ -28,6 +28,7 @@ from rimlight.edge_sampling.choice.views import Lobe, View
 from rimlight.edge_sampling.geometry.device_edges import beside_edge
 from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals
 from rimlight.edge_sampling.parametrisation import Vicinity, material_point
+from rimlight.edge_sampling.rays import spawn_ray
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .indirect_shadows import is_bent, share
@@ -221,7 +222,7 @@ class ShadingBoundary:
         with dr.suspend_grad():
             # Mitsuba's rays start above the surface: look from there.
             towards = self.silhouettes.point(placement, sample, si.p).p - si.p
-            lift = si.spawn_ray(towards).o - si.p
+            lift = spawn_ray(scene, si, towards).o - si.p
             x = mi.Point3f(si.p + lift)
             outline = self.silhouettes.point(placement, sample, x)
             p = outline.p
@@ -240,7 +241,7 @@ class ShadingBoundary:
 
             def look(side, active, slack=1):
                 """What is seen beside the edge, unless something before the edge hides it."""
-                ray = si.spawn_ray(dr.normalize(mi.Point3f(p + side * aside * across) - x))
+                ray = spawn_ray(scene, si, dr.normalize(mi.Point3f(p + side * aside * across) - x))
                 pi = scene.ray_intersect_preliminary(ray, active=active)
                 y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
                 # Not a surface on which the edge lies: beside the edge, that may be met a little earlier.

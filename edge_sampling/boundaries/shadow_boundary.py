@@ -27,6 +27,7 @@ from rimlight.edge_sampling.geometry.device_edges import beside_edge, rounding
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
+from rimlight.edge_sampling.rays import spawn_ray
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .tracer import Tracer
@@ -321,7 +322,7 @@ def fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
     # A ray towards the light will start above the surface: from where it starts, it must meet the edge.
     hit = fallen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
     facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
-    lift = dr.dot(hit.spawn_ray(-ω).o - hit.p, facing)
+    lift = dr.dot(spawn_ray(scene, hit, -ω).o - hit.p, facing)
     cos_x = -dr.dot(facing, ω)
     along = (lift + dr.dot(aside, facing)) / dr.maximum(cos_x, 0.05)
     x = mi.Point3f(hit.p - aside - ω * along - facing * lift)

@@ -21,6 +21,7 @@ from rimlight.edge_sampling import (
     t_junctions,
 )
 from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, has_normal_map, is_smooth, vertices
+from rimlight.edge_sampling.rays import extent
 from rimlight.transport.paths import Depths
 
 #: What perfect mirrors and glass do.
@@ -82,7 +83,7 @@ def lasting_limits(
     if sppi:
         limits += reflected_light(scene, geometry, depths, from_points=from_points)
         if depths.scatters(1):
-            limits += coarse_lamps(scene) + small_scene(scene)
+            limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
     return (*limits, *appearance(scene, moving), *outlines(scene, geometry, edges, moving))
 
@@ -285,22 +286,19 @@ def _fringe(shape: mi.Shape) -> float:
 FRINGE = 0.005
 
 
-def small_scene(scene: mi.Scene) -> list[str]:
-    """What the derivative lacks where the offset of Mitsuba's rays from surfaces is no longer small."""
-    lower, upper = (np.array(corner, np.float64).ravel() for corner in (scene.bbox().min, scene.bbox().max))
-    size, reach = np.linalg.norm(upper - lower), max(np.abs(lower).max(), np.abs(upper).max())
-    offset = float(mi.math.RayEpsilon) * (1 + reach)
-    if not np.isfinite(size) or offset <= LARGE_OFFSET * size:
+def distant_scene(scene: mi.Scene) -> list[str]:
+    """What the derivative lacks where a scene is so far from the origin that rounding shows."""
+    size, reach = extent(scene)
+    if not np.isfinite(size) or reach <= DISTANT * size:
         return []
     return [
-        f"shadows and reflections of curved surfaces are off by some per cent: Mitsuba's rays start {offset:.1g} units "
-        f"above a surface, and the whole scene measures {size:.1g}. Make the scene larger, so that it measures around "
-        "1, and bring it close to the origin."
+        f"shadows and reflections are off by some per cent: the whole scene measures {size:.1g}, and lies {reach:.1g} "
+        "units away from the origin, where single precision cannot tell its points apart. Bring it close to the origin."
     ]
 
 
-#: Offset of rays from surfaces, relative to the diagonal of a scene, up to which there is no warning.
-LARGE_OFFSET = 0.005
+#: Largest coordinate of a scene, relative to its diagonal, up to which there is no warning.
+DISTANT = 1000
 
 
 def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:

@@ -12,6 +12,7 @@ from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below
 from rimlight.edge_sampling.parametrisation import Parametrisation, Vicinity, shown_by_mirror
+from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
 
 
 @dataclass
@@ -162,7 +163,7 @@ class Scattering:
             active &= dr.any(f != 0) | (pdf > 0)  # what is black may still become brighter
         else:
             return L
-        active &= ~self.scene.ray_test(si.spawn_ray_to(ds.p), active)
+        active &= ~self.scene.ray_test(spawn_ray_to(self.scene, si, ds.p), active)
         with dr.resume_grad(when=self.attached):
             return dr.select(active, L, 0)
 
@@ -172,7 +173,7 @@ class Scattering:
         scene = self.scene
         on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
         # One ray answers both questions: is the light visible, and which of its triangles is y on?
-        ray = si.spawn_ray_to(ds.p)
+        ray = spawn_ray_to(scene, si, ds.p)
         before = mi.Float(ray.maxt)
         ray.maxt = dr.select(on_surface, 2 * dr.norm(ds.p - ray.o) - ray.maxt, ray.maxt)
         pi = scene.ray_intersect_preliminary(ray, active=active)
@@ -343,7 +344,7 @@ def next_vertex(
         there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & lune.active) / pdf
         weight = dr.select(lune.active, there, weight)
     active = active & dr.any(weight != 0)
-    ray = si.spawn_ray(si.to_world(bs.wo))
+    ray = spawn_ray(scene, si, si.to_world(bs.wo))
     pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met
     through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
     slides = mirrored if vicinity is None else mirrored | vicinity.is_infinite(bsdf)

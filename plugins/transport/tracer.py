@@ -12,6 +12,7 @@ from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
+from rimlight.edge_sampling.rays import spawn_ray
 
 from .paths import Depths, Vertex, scattered_light
 from .replay import ChosenVertex, Replay, Start
@@ -117,7 +118,8 @@ class PathTracer:
         pi = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         if self.hide_emitters:
             skip = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array of pointers)
-            onwards = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip).spawn_ray(ray.d)
+            at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
+            onwards = spawn_ray(self.scene, at, ray.d)
             pi[skip] = self._skip_area_emitters(self.scene, onwards, True, skip)
         return pi
 
