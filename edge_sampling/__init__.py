@@ -11,9 +11,10 @@ from .choice.sampling import EdgeSample, resample, sample_edge, stratified
 from .choice.silhouettes import Silhouettes
 from .choice.views import Cone, Lobe, View
 from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
-from .geometry.intersections import intersecting_meshes, t_junctions
+from .geometry.intersections import Intersections
 from .geometry.meshes import Geometry, jumping_textures, objects_below
 from .geometry.sources import Sources
+from .geometry.t_junctions import t_junctions
 from .lights import Lights, has_hard_beam
 from .projection.film_parts import Batch, FilmPart, film_parts
 from .projection.sensors import Projection
@@ -34,6 +35,7 @@ __all__ = [
     "Horizon",
     "Horizons",
     "IndirectShadows",
+    "Intersections",
     "Lights",
     "Lobe",
     "Projection",
@@ -49,7 +51,6 @@ __all__ = [
     "find_edges",
     "find_welded_edges",
     "has_hard_beam",
-    "intersecting_meshes",
     "jumping_textures",
     "objects_below",
     "resample",

@@ -109,7 +109,8 @@ class FilmBoundary:
         transmits = [m.bsdf() is not None and bool(m.bsdf().flags() & mi.BSDFFlags.Transmission) for m in meshes]
         if not any(transmits):
             return None
-        vertex = np.repeat(transmits, [m.vertex_count() for m in meshes])
+        counts = [*(m.vertex_count() for m in meshes), geometry.line_vertices]
+        vertex = np.repeat([*transmits, True], counts)  # light may go through one of the meshes that cut
         on_curves = np.zeros(self.outlines.counts[3], bool)
         return mi.Bool(np.concatenate([vertex[self.outlines.first_vertices], on_curves]))
 

@@ -11,6 +11,7 @@ import numpy as np
 from rimlight.edge_sampling.geometry.curves import CurvePoint, Curves
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import Edges
+from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
 
@@ -81,11 +82,12 @@ class FilmOutlines:
     geometry, edges, moving, soft : see `FilmBoundary`.
     """
 
-    _PARTS = ("edges", "corners", "spreads", "horizons", "curves")
+    _PARTS = ("edges", "corners", "spreads", "horizons", "curves", "lines")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool):
         self.geometry, self.soft = geometry, soft
+        self.lines = geometry.lines
         edges, faces = edges.of_meshes(moving), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays.)
         self.edges = DeviceEdges(edges) if len(edges) else None
@@ -271,15 +273,5 @@ class FilmOutlines:
         projection = at.projection
         corners = [dr.gather(mi.Point3f, at.positions, dr.gather(mi.UInt32, corner, face)) for corner in self.corners]
         depth = [projection.film(p).z - projection.near for p in corners]
-        # The corner that has the plane between itself and the two others, first.
-        front = [d > 0 for d in depth]
-        for k in (1, 2):
-            alone = (front[k] != front[0]) & (front[k] != front[3 - k])
-            corners[0], corners[k] = dr.select(alone, corners[k], corners[0]), dr.select(alone, corners[0], corners[k])
-            depth[0], depth[k] = dr.select(alone, depth[k], depth[0]), dr.select(alone, depth[0], depth[k])
-        crossed = (front[0] != front[1]) | (front[0] != front[2])
-        points = []
-        for k in (1, 2):
-            t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)
-            points.append(dr.select(crossed, dr.lerp(corners[0], corners[k], t), dr.nan))
-        return points[0], points[1]
+        a, b, crossed = cut_by_plane(corners, depth)
+        return dr.select(crossed, a, dr.nan), dr.select(crossed, b, dr.nan)

@@ -85,6 +85,7 @@ class Horizons:
             np.full(m.vertex_count(), (-1 if m.has_flipped_normals() else 1) if s else 0, np.float32)
             for m, s in zip(geometry.meshes, smooth, strict=True)
         ]
+        signs.append(np.zeros(geometry.line_vertices, np.float32))
         numbers = [np.arange(m.face_count(), dtype=np.uint32) for m in meshes]
         #: (V,), of each vertex of the geometry: -1 if Mitsuba turns its normal round, 0 where it is not interpolated.
         self.sign = mi.Float(np.concatenate(signs)) * dr.opaque(mi.Float, 1) if meshes else None

@@ -69,6 +69,9 @@ class ShadingBoundary:
         lamps = [e.get_shape() for e in scene.emitters() if e.flags() & mi.EmitterFlags.Surface]
         self.bent_lamps = [mi.ShapePtr(s) for s in lamps if is_bent(s)]
         emitters = scene.emitters()
+        #: Do meshes cut through lamps? That is no shadow, which would be found from the lamp.
+        lines = silhouettes.lines
+        self.cut_lamps = lines is not None and any(geometry.meshes[i].is_emitter() for i in lines.meshes)
         #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
         lights = [i for i, e in enumerate(emitters) if not e.flags() & mi.EmitterFlags.Delta]
         self.lights = mi.UInt32(lights or [0])  # Dr.Jit 1.5 cannot freeze empty arrays
@@ -88,7 +91,7 @@ class ShadingBoundary:
 
     def _counts_at_first(self, emitter: mi.Emitter) -> bool:
         if emitter.flags() & mi.EmitterFlags.Surface:
-            return self.glossy
+            return self.glossy or self.cut_lamps
         return not hasattr(emitter, "light_count") or emitter.background is not None
 
     def refit(self) -> None:
@@ -163,7 +166,7 @@ class ShadingBoundary:
                 arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
                 seen_past = outline.outward(dr.cross(d, outline.tangent)) != 0
                 crease = self.silhouettes.crease(e, outline) * (1 - vicinity.far(r2))
-                return dr.max(f) * arc * dr.select(seen_past, 1, crease)
+                return dr.max(f) * arc * dr.select(seen_past | outline.is_line, 1, crease)
 
             e = resample(draw, unshadowed, sampler, CANDIDATES, active)
             e.density *= dr.select(emission, p * p_light, 1 - p)
@@ -233,6 +236,12 @@ class ShadingBoundary:
             active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
             outward = outline.outward(across)
+            if self.silhouettes.lines is not None:
+                # Beside a line in which meshes cut through each other, both sides slide past it. One of them is looked
+                # at, by chance.
+                one = dr.select(sampler.next_1d(active) < 0.5, mi.Float(1), -1)
+                outward = dr.select(outline.is_line, one, outward)
+                n_dl = dr.select(outline.is_line, 2 * n_dl, n_dl)
             # Of a crease, both sides are faces of its own.
             near = 1 - vicinity.far(dr.square(distance))
             active &= (outward != 0) | (near > 0)
@@ -254,7 +263,8 @@ class ShadingBoundary:
             active &= ~hidden & (past | own)
             L = mi.Spectrum(0)
             if self.emission:
-                L += self._emitted(tracer, point, ray, y, ω, pdf, active & past & emission, light)
+                found_too = ~mi.Bool(outline.is_line)
+                L += self._emitted(tracer, point, ray, y, ω, pdf, active & past & emission, light, found_too)
             valid = active & y.is_valid()
             if tracer.scatters(2):
                 again = sampler.clone()
@@ -268,13 +278,15 @@ class ShadingBoundary:
                 scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune)
                 L += dr.select(reflected, scattered, 0)
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
-                other_ray, other_pi, _, hidden, own = look(-side, active & ~emission & (near > 0), slack=2)
-                reflected = active & ~emission & (near > 0) & ~hidden & own
+                of_faces = active & ~emission & (near > 0) & ~outline.is_line
+                other_ray, other_pi, _, hidden, own = look(-side, of_faces, slack=2)
+                reflected = of_faces & ~hidden & own
                 beside = reflected if self.smooth else None
                 other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected, beside, lune)
                 # What its own faces show, held in its direction in the vicinity.
                 faces = dr.select(reflected, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)
+                faces = dr.select(outline.is_line, 0, faces)
             L = dr.select(active & past, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)
 
@@ -287,8 +299,9 @@ class ShadingBoundary:
             value = -side * L * (edge - beyond)
             return value + faces * edge if tracer.scatters(2) else value
 
-    def _emitted(self, tracer, point, ray, y, ω, pdf, active, light: mi.EmitterPtr) -> mi.Spectrum:
-        """Light that one light emits at y towards a point. pdf : density of ω among samples of the BSDF there."""
+    def _emitted(self, tracer, point, ray, y, ω, pdf, active, light: mi.EmitterPtr, found_too: mi.Bool) -> mi.Spectrum:
+        """Light that one light emits at y towards a point. pdf : density of ω among samples of the BSDF there.
+        found_too : may the edge throw a shadow that is found from the light?"""
         scene, si = tracer.scene, point.si
         at_first = point.depth == 1
         emitter = y.emitter(scene, active)
@@ -298,7 +311,7 @@ class ShadingBoundary:
             mine = lit & (emitter == mi.EmitterPtr(several))
             L = dr.select(mine, several.eval_background(y, mine), L)
         # Shadows that are found from the lights, too; all of those on what the sensor sees.
-        shared = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+        shared = lit & found_too & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
         for lamp in self.bent_lamps:
             shared &= at_first | (y.shape != lamp)
         on_smooth = lit & ~shared & self.smooth_lamps.are(y.shape) if len(self.smooth_lamps) else mi.Bool(False)

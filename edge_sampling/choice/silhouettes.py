@@ -39,11 +39,13 @@ class OutlinePoint:
     p : mi.Point3f, world space; attached to its placement.
     tangent : mi.Vector3f, dp/dt, where t is the parameter that was sampled. Detached.
     inwards : two vectors from p towards the faces on the two sides of an edge. Detached.
+    is_line : is it on a line in which meshes cut through each other? Then both faces go on beyond it.
     """
 
     p: mi.Point3f
     tangent: mi.Vector3f
     inwards: tuple[mi.Vector3f, mi.Vector3f]
+    is_line: mi.Bool | bool = False
 
     @property
     def normals(self) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -71,14 +73,18 @@ class Silhouettes:
     Moving edges are a group of their own, so that viewers that stand still need not look at the others.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "count", "groups", "centre"))  # for `dr.freeze`
+    _NUMBERS = ("count", "groups", "centre", "_first_line")
+    DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
         self.geometry = geometry
+        #: In which meshes cut through each other; they are the last edges.
+        self.lines = geometry.lines
         self.count = len(edges)
+        self._first_line = dr.opaque(mi.UInt32, self.count - int(edges.is_line.sum()))
         moves = np.ones(len(edges), bool)
         if moving is not None:
-            moves = np.array(moving, bool)[edges.mesh].any(axis=1)
+            moves = edges.is_line | np.array(moving, bool)[edges.mesh].any(axis=1)
         groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         #: Number of groups of edges.
         self.groups = len(groups)
@@ -194,8 +200,10 @@ class Silhouettes:
             a, b = edges.end_points(placement.positions, index)
             p = dr.lerp(a, b, sample.t)
             with dr.suspend_grad():
-                opposite = edges.opposite(placement.positions, index)
-                point = OutlinePoint(p, dr.detach(b - a), tuple(dr.detach(o - p) for o in opposite))
+                inwards = tuple(dr.detach(o - p) for o in edges.opposite(placement.positions, index))
+                point = OutlinePoint(p, dr.detach(b - a), inwards)
+                if self.lines is not None:
+                    point.is_line = index >= self._first_line
             if self.curves is None:
                 return point
         piece = sample.edge - self.count
@@ -208,4 +216,5 @@ class Silhouettes:
             return on_curve
         choose = lambda x, y: dr.select(on_edge, x, y)
         inwards = tuple(choose(x, y) for x, y in zip(point.inwards, on_curve.inwards, strict=True))
-        return OutlinePoint(choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent), inwards)
+        p, tangent = choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent)
+        return OutlinePoint(p, tangent, inwards, point.is_line & on_edge)

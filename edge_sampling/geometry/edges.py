@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
@@ -43,6 +43,8 @@ class Edges:
     mesh     : (E, 2), uint32; index into `Geometry.meshes` of the face on each side.
     kind     : (E,), uint8; an `EdgeKind`.
     count    : (E,), uint32; number of faces.
+    is_line  : (E,), bool; is it a line in which meshes cut through each other (`Intersections`)? Its vertices are not
+               those of a mesh, its mesh is not told, and its faces do not end there.
 
     The end points of the first side are in the order in which its face runs through them.
     """
@@ -52,6 +54,7 @@ class Edges:
     mesh: np.ndarray
     kind: np.ndarray
     count: np.ndarray
+    is_line: np.ndarray
 
     @property
     def open(self) -> np.ndarray:
@@ -63,11 +66,11 @@ class Edges:
 
     def take(self, which: np.ndarray) -> Edges:
         """Some of the edges, by index or by mask."""
-        return Edges(self.vertices[which], self.opposite[which], self.mesh[which], self.kind[which], self.count[which])
+        return Edges(*(getattr(self, f.name)[which] for f in fields(self)))
 
     def of_meshes(self, wanted: np.ndarray) -> Edges:
-        """The edges that have a face in one of the meshes for which `wanted` (bool) holds."""
-        return self.take(wanted[self.mesh].any(axis=1))
+        """The edges that have a face in one of the meshes for which `wanted` (bool) holds, and all lines."""
+        return self.take(self.is_line | wanted[self.mesh].any(axis=1))
 
     def summary(self) -> dict[str, int]:
         counts = np.bincount(self.kind, minlength=len(EdgeKind))
@@ -154,13 +157,15 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
         mesh=np.stack([mesh0, mesh1], 1),
         kind=kind,
         count=count.astype(np.uint32),
+        is_line=np.zeros(len(face0), bool),
     )
     return edges, Weld(weld, tolerance)
 
 
 def _no_edges() -> Edges:
     none = np.zeros((0, 2), np.uint32)
-    return Edges(np.zeros((0, 2, 2), np.uint32), none, none, np.zeros(0, np.uint8), np.zeros(0, np.uint32))
+    flat = lambda kind: np.zeros(0, kind)
+    return Edges(np.zeros((0, 2, 2), np.uint32), none, none, flat(np.uint8), flat(np.uint32), flat(bool))
 
 
 def _weld_equal(point: np.ndarray) -> np.ndarray:

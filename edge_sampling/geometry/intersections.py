@@ -1,83 +1,326 @@
-"""Meshes that meet in lines which are no edges, or edges of both.
+"""The lines in which meshes cut through each other: boundaries that are edges of neither.
 
-Where meshes cut through each other, the line of the cut is no edge, so its jump cannot be sampled. Where open edges lie
-on one another without having their end points in common (a T-junction), they are not welded, so a jump counts twice.
+Two triangles that cut each other have a piece of a line in common, along n₁ × n₂. Its ends are where an edge of one
+goes through the face of the other. So rays along all edges find the pairs of triangles: an edge that goes through a
+face makes one pair of each of its own faces with that face. Each pair is found twice, once from each end of its piece,
+and counts where it is found from the lower one.
+
+The line moves as the planes do. A point p of it has no velocity of its own along the line; across it, ṗ = α n₁ + β n₂
+with α and β such that p stays in both planes: nᵢ · ṗ = −ġᵢ, gᵢ = nᵢ · (p − cᵢ) with a corner cᵢ. What is seen on
+either side is *not* fixed to the line, as it is to an edge: both surfaces slide past it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import cKDTree
 
-from .device_edges import DeviceEdges
-from .edges import Edges
+from .device_edges import rounding
+from .edges import EdgeKind, Edges, Weld
 from .meshes import Geometry
 
-#: An edge that ends on a face, or lies in it, does not cut it. Relative to its length; cosine of the angle.
-TOUCHES = 1e-3
+#: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
+IN_ONE_PLANE = 1e-4
 
-#: An end point lies on an edge within this distance, relative to the length of the edge; edges are parallel within this
-#: sine.
-ON_EDGE = 1e-5
-PARALLEL = 1e-4
+#: An edge is followed through at most so many faces.
+MOST_FACES = 1024
 
-#: At most so many pairs of an edge and an end point near it are looked at: a soup of long triangles has too many.
-PAIRS = 10**7
+#: Vertices that stand for the line of one pair: its two ends, and a point on each side of it.
+VERTICES = 4
+
+#: Least number of pairs for which there is space.
+LEAST_SPACE = 64
+
+Triangle = list[mi.Point3f]
 
 
-def intersecting_meshes(scene: mi.Scene, geometry: Geometry, edges: Edges) -> set[tuple[int, int]]:
-    """Pairs of meshes, by their numbers, of which an edge of one goes through a face of the other.
+@dataclass(frozen=True)
+class _Walked:
+    """Edges along which rays are traced, on the device: their end points, the third vertices of their two faces; and
+    have they two? mesh : on the host, of which they are."""
 
-    Each edge is traced as a ray, once: an edge that meets several meshes tells of the first one only.
+    ends: list[mi.UInt32]
+    opposite: list[mi.UInt32]
+    two: mi.Bool
+    mesh: np.ndarray
+
+    @staticmethod
+    def of(edges: Edges) -> _Walked:
+        ends = [_index(edges.vertices[:, 0, k]) for k in (0, 1)]
+        return _Walked(ends, [_index(edges.opposite[:, k]) for k in (0, 1)], mi.Bool(edges.count > 1), edges.mesh[:, 0])
+
+
+class Intersections:
+    """The lines in which the meshes of a scene cut through each other, and through themselves.
+
+    Parameters
+    ----------
+    scene, geometry : the meshes. edges, weld : of them.
+
+    There is space for `capacity` pairs of triangles. What is not needed has the length 0.
     """
-    if not len(edges):
-        return set()
-    with dr.suspend_grad():
-        device = DeviceEdges(edges)
-        a, b = device.end_points(geometry.positions(), dr.arange(mi.UInt32, len(edges)))
+
+    DRJIT_STRUCT = dict.fromkeys(("corners",))  # for `dr.freeze`
+
+    def __init__(self, scene: mi.Scene, geometry: Geometry, edges: Edges, weld: Weld):
+        self._edges, self._place = edges, _index(weld.place)
+        faces = geometry.faces((True,) * len(geometry.meshes))
+        self._faces = [_index(faces[:, k]) for k in range(3)]
+        self._first_face = _first_faces(geometry)
+        #: The mesh of each face, on the device.
+        counts = [m.face_count() for m in geometry.meshes]
+        self._mesh_of_face = _index(np.repeat(np.arange(len(counts)), counts))
+        self._walked: dict[tuple[int, ...], _Walked] = {}
+        #: Where the meshes were (held, so that the number of an array is given to no other one).
+        self._at: list[mi.Float] | None = None
+        self.count = self.capacity = 0
+        #: Which may cut each other, since their boxes overlap: their numbers.
+        self.meshes: tuple[int, ...] = ()
+        #: Six vertices of each pair of triangles: (capacity,) each.
+        self.corners: list[mi.UInt32] = []
+        #: Meshes that cut through themselves. (Those that come to do so later are not noticed.)
+        self._by_themselves = self._find_themselves(scene, geometry)
+
+    # ---------------------- Search ----------------------
+
+    def find(self, scene: mi.Scene, geometry: Geometry) -> bool:
+        """Find the pairs of triangles, as the meshes are now; return whether there is now more space for them, or
+        other meshes may cut each other. On the host, and reads from the device: not in frozen functions."""
+        arrays = [dr.detach(m.vertex_positions_buffer()) for m in geometry.meshes]
+        if self._at is not None and all(a.index == b.index for a, b in zip(arrays, self._at, strict=True)):
+            return False
+        self._at = arrays
+        before = self.meshes, self.capacity
+        self.meshes = meshes = tuple(sorted(_overlapping(geometry) | self._by_themselves))
+        if not meshes:
+            self._keep([], 0)
+            return bool(self.capacity) and before != (meshes, self.capacity)
+        with dr.suspend_grad():
+            walked, positions = self._edges_of(meshes), dr.detach(replace(geometry, lines=None).positions())
+            counts = self._walk(scene, positions, walked)
+            ends = dr.cumsum(counts)
+            count = int(ends[-1])
+            if count > self.capacity:
+                self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
+            found = [dr.zeros(mi.UInt32, max(count, 1)) for _ in range(6)]
+            if count:
+                self._walk(scene, positions, walked, into=found, start=ends - counts)
+            self._keep(found, count)
+        return bool(self.capacity) and before != (meshes, self.capacity)
+
+    def _keep(self, found: list[mi.UInt32], count: int) -> None:
+        """Fill up what is not needed with a vertex, which makes triangles without area."""
+        self.count = count
+        if self.capacity:
+            slot = dr.arange(mi.UInt32, self.capacity)
+            used = slot < dr.opaque(mi.UInt32, count)
+            self.corners = [dr.gather(mi.UInt32, f, slot, used) for f in found or [dr.zeros(mi.UInt32, 1)] * 6]
+            dr.eval(self.corners)
+
+    def _edges_of(self, meshes: tuple[int, ...]) -> _Walked:
+        if meshes not in self._walked:
+            wanted = np.zeros(int(self._edges.mesh.max(initial=0)) + 1, bool)
+            wanted[[m for m in meshes if m < len(wanted)]] = True
+            self._walked[meshes] = _Walked.of(self._edges.of_meshes(wanted))
+        return self._walked[meshes]
+
+    def _find_themselves(self, scene: mi.Scene, geometry: Geometry) -> set[int]:
+        if not len(self._edges):
+            return set()
+        with dr.suspend_grad():
+            walked = _Walked.of(self._edges)
+            counts = self._walk(scene, dr.detach(geometry.positions()), walked, themselves=True)
+        return set(walked.mesh[counts.numpy() > 0].tolist())
+
+    def _walk(
+        self,
+        scene: mi.Scene,
+        positions: mi.Float,
+        walked: _Walked,
+        *,
+        into: list[mi.UInt32] | None = None,
+        start: mi.UInt32 | None = None,
+        themselves: bool = False,
+    ) -> mi.UInt32:
+        """Follow each edge through all the faces that it goes through; how many pairs it finds from their lower ends:
+        (E,).
+
+        into, start : where to write the vertices of the pairs, from where on for each edge.
+        themselves : only those within one mesh.
+        """
+        point = lambda i: dr.gather(mi.Point3f, positions, i)
+        a, b = (point(e) for e in walked.ends)
+        own = [[a, b, point(o)] for o in walked.opposite]
+        place = [dr.gather(mi.UInt32, self._place, e) for e in walked.ends]
+        mesh = _index(walked.mesh)
         length = dr.norm(b - a)
-        ray = mi.Ray3f(dr.lerp(a, b, TOUCHES), (b - a) / length)
-        ray.maxt = length * (1 - 2 * TOUCHES)
-        active = (length > 0) & dr.isfinite(length)
-        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
-        cuts = active & si.is_valid() & (dr.abs_dot(si.n, ray.d) > TOUCHES)
-        hit = dr.full(mi.UInt32, len(geometry.meshes), len(edges))
-        for i, mesh in enumerate(geometry.meshes):
-            hit[si.shape == mi.ShapePtr(mesh)] = i
-        cuts, hit = np.array(cuts), np.array(hit)
-    own = edges.mesh[:, 0]
-    cuts &= (hit < len(geometry.meshes)) & (hit[:, None] != edges.mesh).all(1)
-    return {tuple(sorted(map(int, pair))) for pair in np.unique(np.stack([own[cuts], hit[cuts]], 1), axis=0)}
+        d = (b - a) / length
+        step = rounding(a, b)
+
+        def through(t, count, k, active):
+            ray = mi.Ray3f(mi.Point3f(a + t * d), d)
+            ray.maxt = length - t
+            pi = scene.ray_intersect_preliminary(ray, active=active)
+            active &= pi.is_valid()
+            number = dr.reinterpret_array(mi.UInt32, pi.shape)
+            first = dr.gather(mi.UInt32, self._first_face, number, active & (number < dr.width(self._first_face)))
+            is_mesh = active & (first > 0)
+            face = dr.select(is_mesh, first - 1 + pi.prim_index, 0)
+            vertices = [dr.gather(mi.UInt32, corner, face, is_mesh) for corner in self._faces]
+            foreign = mi.Bool(is_mesh)
+            for v in vertices:
+                at = dr.gather(mi.UInt32, self._place, v, is_mesh)
+                foreign &= (at != place[0]) & (at != place[1])
+            if themselves:
+                foreign &= dr.gather(mi.UInt32, self._mesh_of_face, face, is_mesh) == mesh
+            other, met = [point(v) for v in vertices], ray(pi.t)
+            for side, mine in enumerate(own):
+                lower, upper, cut = common_line(mine, other)
+                found = foreign & cut & (dr.squared_norm(met - lower) < dr.squared_norm(met - upper))
+                if side:
+                    found &= walked.two
+                if into is not None:
+                    pair = (*walked.ends, walked.opposite[side], *vertices)
+                    for target, v in zip(into, pair, strict=True):
+                        dr.scatter(target, v, start + count, found)
+                count += dr.select(found, 1, 0)
+            t += pi.t + step
+            return t, count, k + 1, active & (t < length) & (k < MOST_FACES)
+
+        width = len(walked.mesh)
+        zero = dr.zeros(mi.UInt32, width)
+        state = (dr.zeros(mi.Float, width), mi.UInt32(zero), mi.UInt32(zero), (length > 0) & dr.isfinite(length))
+        return dr.while_loop(state, lambda *s: s[-1], through, label="edges through faces")[1]
+
+    # ---------------------- As edges ----------------------
+
+    @property
+    def vertices(self) -> int:
+        """Number of the vertices that stand for the lines."""
+        return VERTICES * self.capacity
+
+    def points(self, positions: mi.Float) -> list[mi.Point3f]:
+        """The vertices of all lines, first their lower ends, then their upper ends, then points of the first triangle's
+        plane on both sides: `VERTICES` times (capacity,), world space; attached to `positions`, (3 V,)."""
+        corners = [dr.gather(mi.Point3f, positions, c) for c in self.corners]
+        first, second = corners[:3], corners[3:]
+        with dr.suspend_grad():
+            still = [[dr.detach(p) for p in t] for t in (first, second)]
+            lower, upper, cut = common_line(*still)
+            lower, upper = (dr.select(cut, p, still[0][0]) for p in (lower, upper))
+            aside = dr.cross(upper - lower, _normal(still[0]))
+            sides = [mi.Point3f(lower + dr.select(cut, s * aside, 0)) for s in (1, -1)]
+        return [*(_follow(p, first, second, cut) for p in (lower, upper)), *sides]
+
+    def as_edges(self, edges: Edges, vertices: int) -> Edges:
+        """`edges`, and after them these lines, as edges that are boundaries from everywhere.
+
+        vertices : number of those of all meshes, after which those of the lines come.
+        """
+        n = self.capacity
+        k = np.arange(n, dtype=np.uint32) + np.uint32(vertices)
+        ends = np.stack([k, k + n], 1)
+        lines = Edges(
+            vertices=np.stack([ends, ends], 1),
+            opposite=np.stack([k + 2 * n, k + 3 * n], 1),
+            mesh=np.zeros((n, 2), np.uint32),
+            kind=np.full(n, EdgeKind.JUMP, np.uint8),
+            count=np.full(n, 4, np.uint32),
+            is_line=np.ones(n, bool),
+        )
+        both = lambda name: np.concatenate([getattr(edges, name), getattr(lines, name)])
+        return Edges(*(both(f.name) for f in fields(Edges)))
 
 
-def t_junctions(geometry: Geometry, edges: Edges) -> set[tuple[int, int]]:
-    """Pairs of meshes, by their numbers, of which an open edge of one lies on an open edge of the other, from a point
-    inside of this one on; a mesh may form a pair with itself. On the host, and cheap: only open edges take part."""
-    edges = edges.take(edges.open)
-    if len(edges) < 2:
+def common_line(first: Triangle, second: Triangle) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
+    """Lower and upper end of the piece of a line that two triangles have in common; do they cut each other? Detached.
+
+    The same for the triangles in another order, but for rounding. Triangles that only touch do not cut each other.
+    """
+    normals = _normal(first), _normal(second)
+    along = dr.cross(*normals)
+    cut = dr.norm(along) > IN_ONE_PLANE
+    # Of two opposite directions, that whose largest coordinate is positive.
+    size = dr.abs(along)
+    largest = dr.select(size.x >= dr.maximum(size.y, size.z), along.x, dr.select(size.y >= size.z, along.y, along.z))
+    along = dr.mulsign(dr.normalize(along), largest)
+    slack = dr.maximum(rounding(first[0], second[0]), dr.maximum(rounding(*first[1:]), rounding(*second[1:])))
+    ends = []
+    for triangle, n, other in ((first, normals[1], second), (second, normals[0], first)):
+        a, b, crosses = cut_by_plane(triangle, [dr.dot(n, p - other[0]) for p in triangle], slack)
+        cut &= crosses
+        swap = dr.dot(along, a - b) > 0
+        ends.append((dr.select(swap, b, a), dr.select(swap, a, b)))
+    (a, b), (c, d) = ends
+    lower, upper = dr.select(dr.dot(along, a - c) > 0, a, c), dr.select(dr.dot(along, b - d) > 0, d, b)
+    return lower, upper, cut & (dr.dot(along, upper - lower) > slack)
+
+
+def cut_by_plane(
+    corners: Triangle, height: list[mi.Float], slack: mi.Float | float = 0.0
+) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
+    """Where a plane cuts through a triangle: two points of its sides; and does it?
+
+    height : of the corners over the plane. slack : of them that is taken for 0.
+    """
+    corners, height = list(corners), list(height)
+    above = [h > slack for h in height]
+    below = [h < -slack for h in height]
+    crosses = (above[0] | above[1] | above[2]) & (below[0] | below[1] | below[2])
+    # The corner that has the plane between itself and the two others, first.
+    for k in (1, 2):
+        alone = (above[k] != above[0]) & (above[k] != above[3 - k])
+        corners[0], corners[k] = dr.select(alone, corners[k], corners[0]), dr.select(alone, corners[0], corners[k])
+        height[0], height[k] = dr.select(alone, height[k], height[0]), dr.select(alone, height[0], height[k])
+    points = []
+    for k in (1, 2):
+        t = height[0] / dr.select(crosses, height[0] - height[k], 1)
+        points.append(dr.lerp(corners[0], corners[k], dr.clip(t, 0, 1)))
+    return points[0], points[1], crosses
+
+
+def _normal(triangle: Triangle) -> mi.Vector3f:
+    a, b, c = triangle
+    return dr.normalize(dr.cross(b - a, c - a))
+
+
+def _follow(p: mi.Point3f, first: Triangle, second: Triangle, active: mi.Bool) -> mi.Point3f:
+    """The point p of the line, attached: it stays in both planes."""
+    normals, heights = [], []
+    for triangle in (first, second):
+        n = _normal(triangle)
+        g = dr.dot(n, p - triangle[0])
+        normals.append(dr.detach(n))
+        heights.append(dr.select(active, g - dr.detach(g), 0))
+    (n, m), (g, h) = normals, heights
+    cosine = dr.dot(n, m)
+    determinant = dr.select(active, 1 - dr.square(cosine), 1)
+    α, β = (cosine * h - g) / determinant, (cosine * g - h) / determinant
+    return mi.Point3f(p + dr.select(active, n * α + m * β, 0))
+
+
+def _overlapping(geometry: Geometry) -> set[int]:
+    """Meshes whose boxes overlap that of another one."""
+    boxes = [m.bbox() for m in geometry.meshes]
+    lower, upper = (np.array([np.ravel(getattr(b, k)) for b in boxes], np.float64) for k in ("min", "max"))
+    if len(boxes) < 2:
         return set()
-    ends = geometry.host_positions()[edges.vertices[:, 0]].astype(np.float64)
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    usable = np.isfinite(length) & (length > 0)
-    edges, ends, length = edges.take(usable), ends[usable], length[usable]
-    if len(edges) < 2:
-        return set()
-    middle, axis = ends.mean(1), (ends[:, 1] - ends[:, 0]) / length[:, None]
-    # The ball about an edge, without its own end points.
-    tree, radius = cKDTree(ends.reshape(-1, 3)), 0.5 * length * (1 - 2 * TOUCHES)
-    count = tree.query_ball_point(middle, radius, return_length=True)
-    near = np.flatnonzero(count)
-    near = near[np.cumsum(count[near]) <= PAIRS]
-    if len(near) == 0:
-        return set()
-    found = np.concatenate(tree.query_ball_point(middle[near], radius[near])).astype(np.int64)
-    long, short, end = np.repeat(near, count[near]), found // 2, found % 2
-    inside, beyond = ends[short, end], ends[short, 1 - end]
-    # Distances from the line of the long edge; single precision may tell no more.
-    distance = [np.linalg.norm(np.cross(q - middle[long], axis[long]), axis=1) for q in (inside, beyond)]
-    tolerance = np.maximum(ON_EDGE * length[long], 8 * np.finfo(np.float32).eps * np.abs(inside).max(1))
-    on = (distance[0] < tolerance) & (distance[1] < tolerance + PARALLEL * length[short])
-    pairs = np.sort(np.stack([edges.mesh[long[on], 0], edges.mesh[short[on], 0]], 1), axis=1)
-    return {(int(a), int(b)) for a, b in np.unique(pairs, axis=0)}
+    apart = (lower[:, None] > upper[None]).any(2)
+    overlap = ~(apart | apart.T)
+    np.fill_diagonal(overlap, False)
+    return set(np.flatnonzero(overlap.any(1)).tolist())
+
+
+def _first_faces(geometry: Geometry) -> mi.UInt32:
+    """By the number that Dr.Jit gives to a shape: the number of its first face, plus 1; 0 if it is no mesh."""
+    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(m))[0]) for m in geometry.meshes]
+    table = np.zeros(max(numbers, default=0) + 1, np.uint32)
+    table[numbers] = 1 + np.cumsum([0, *(m.face_count() for m in geometry.meshes)])[:-1]
+    return mi.UInt32(table)
+
+
+def _index(numbers: np.ndarray) -> mi.UInt32:
+    return mi.UInt32(np.ascontiguousarray(numbers, dtype=np.uint32))

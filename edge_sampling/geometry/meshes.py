@@ -22,11 +22,14 @@ class Geometry:
     meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known.
     analytic : spheres, disks, cylinders, whose outlines are known curves.
     others : all else (instances, hair, ...). They occlude and receive light, but must not move.
+    lines : in which the meshes cut through each other (`Intersections`), whose vertices then come after those of the
+        meshes; None: there are none.
     """
 
     meshes: tuple[Any, ...]
     analytic: tuple[Any, ...] = ()
     others: tuple[Any, ...] = ()
+    lines: Any = None
 
     @staticmethod
     def of(scene: mi.Scene) -> Geometry:
@@ -34,6 +37,11 @@ class Geometry:
         meshes = tuple(s for s in shapes if s.is_mesh() and s.class_name() != "EllipsoidsMesh")
         analytic = tuple(s for s in shapes if s.class_name() in CURVES)
         return Geometry(meshes, analytic, tuple(s for s in shapes if s not in meshes and s not in analytic))
+
+    @property
+    def line_vertices(self) -> int:
+        """Number of the vertices of `lines`."""
+        return self.lines.vertices if self.lines is not None else 0
 
     def faces(self, wanted: tuple[bool, ...]) -> np.ndarray:
         """Faces of the meshes that are `wanted`: (F, 3), indices into `positions`, on the host."""
@@ -66,20 +74,25 @@ class Geometry:
 
     def positions(self) -> mi.Float:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
-        return _concat([m.vertex_positions_buffer() for m in self.meshes])
+        positions = _concat([m.vertex_positions_buffer() for m in self.meshes])
+        if self.lines is None:
+            return positions
+        return dr.concat([positions, *(dr.ravel(p) for p in self.lines.points(positions))])
 
     def host_positions(self) -> np.ndarray:
         """Vertex positions of all meshes: (V, 3), world space, on the host."""
+        if self.lines is not None:
+            with dr.suspend_grad():
+                return np.array(self.positions()).reshape(-1, 3)
         return np.concatenate([vertices(m) for m in self.meshes]) if self.meshes else np.zeros((0, 3), np.float32)
 
     def normals(self) -> mi.Float:
         """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Attached."""
-        return _concat(
-            [
-                m.vertex_normals_buffer() if has_interpolated_normals(m) else dr.zeros(mi.Float, 3 * m.vertex_count())
-                for m in self.meshes
-            ]
-        )
+        none = lambda count: dr.zeros(mi.Float, 3 * count)
+        normals = [
+            m.vertex_normals_buffer() if has_interpolated_normals(m) else none(m.vertex_count()) for m in self.meshes
+        ]
+        return _concat([*normals, none(self.line_vertices)] if self.lines is not None else normals)
 
 
 def faces(mesh: Any) -> np.ndarray:

@@ -15,7 +15,6 @@ from rimlight.edge_sampling import (
     Geometry,
     film_parts,
     has_hard_beam,
-    intersecting_meshes,
     jumping_textures,
     objects_below,
     t_junctions,
@@ -156,14 +155,6 @@ def outlines(scene: mi.Scene, geometry: Geometry, edges: Edges, moving: Moving) 
             f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid). Replace "
             "them by meshes."
         )
-    cut = {
-        (geometry.meshes[i].id(), geometry.meshes[j].id())
-        for i, j in intersecting_meshes(scene, geometry, edges)
-        if moving.flags[i] or moving.flags[j] or moving.camera
-    }
-    if cut:
-        pairs = ", ".join(f'"{a}" and "{b}"' for a, b in sorted(cut))
-        limits.append(f"the derivative lacks the lines in which meshes cut through each other: {pairs}.")
     # Of edges that lie on one another, those of what stands still have no velocity, and do not count.
     twice = sorted(
         (geometry.meshes[i].id(), geometry.meshes[j].id())

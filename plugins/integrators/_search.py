@@ -15,6 +15,7 @@ from rimlight.edge_sampling import (
     FilmBoundary,
     Geometry,
     IndirectShadows,
+    Intersections,
     Lights,
     ShadingBoundary,
     ShadowBoundary,
@@ -51,6 +52,7 @@ class BoundarySearch:
         self.who, self.depths, self.planes, self.from_points = who, depths, planes, from_points
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
+        self._lines: Intersections | None = None
         self._sources: Sources | None = None
         self._checked = False
         self._partial: PartialParameters | None = None
@@ -78,6 +80,8 @@ class BoundarySearch:
             moving = self._what_moves(scene, sensor, geometry)
         if not moving.anything:
             return Boundaries(limits=limits)
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            self._find_lines(scene)
         if not self._checked:
             # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
             self._refuse_while_recording()
@@ -102,13 +106,27 @@ class BoundarySearch:
             return
         self._refuse_while_recording()
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
-        self.geometry = self.edges = self._sources = self._partial = self._media = None
+        self.geometry = self.edges = self._lines = self._sources = self._partial = self._media = None
         self._boundaries, self._beyond = {}, {}
         collect_before()
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
+        self._lines = Intersections(scene, geometry, self.edges, weld)
         self._sources = Sources(scene, params, geometry, self.edges, weld)
         self._partial, self._media = PartialParameters(scene), Media(scene)
+
+    def _find_lines(self, scene: mi.Scene) -> None:
+        """Find the lines in which the meshes cut through each other now."""
+        lines = self._lines
+        if lines.find(scene, self.geometry):
+            self.geometry, self._boundaries = replace(self.geometry, lines=lines), {}
+            collect_before()
+
+    @property
+    def _edges_and_lines(self) -> Edges:
+        lines = self.geometry.lines
+        count = sum(m.vertex_count() for m in self.geometry.meshes)
+        return self.edges if lines is None else lines.as_edges(self.edges, count)
 
     def _refuse_while_recording(self) -> None:
         if dr.flag(dr.JitFlag.FreezingScope):
@@ -141,7 +159,8 @@ class BoundarySearch:
         on_film = np.array([m or moving.camera for m in moving.flags], bool)
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
         soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
-        film = FilmBoundary(self.geometry, self.edges, on_film, lights, soft=soft) if on_film.any() else None
+        edges = self._edges_and_lines
+        film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft) if on_film.any() else None
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect = self._in_reflected_light(scene, moving, sppi)
@@ -159,7 +178,7 @@ class BoundarySearch:
         if not sppi or not scene.emitters() or not self.depths.scatters(1):
             return None, None, None
         everything = moving.camera or moving.lights
-        silhouettes = Silhouettes(self.geometry, self.edges, None if everything else moving.flags)
+        silhouettes = Silhouettes(self.geometry, self._edges_and_lines, None if everything else moving.flags)
         if not len(silhouettes):
             return None, None, None
         shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, None

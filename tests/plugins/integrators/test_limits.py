@@ -214,7 +214,8 @@ def test_fringe_of_coarse_lamps(coarse):
 
 @pytest.mark.parametrize("distance", [0, 100, 1e4])
 def test_scenes_far_from_the_origin(distance):
-    floor = cases.mesh("floor", np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]) + [distance, 0, 0], [[0, 1, 2]])
+    corners = np.add([distance, 0, 0], [[-1, -1, 0], [1, -1, 0], [0, 1, 0]])
+    floor = cases.mesh("floor", corners, [[0, 1, 2]])
     sensor = cases.camera((distance, 0, -5), (distance, 0, 0))
     found = said(cases.scene(sensor=sensor, floor=floor, sky=cases.constant()), "floor.vertex_positions")
     assert ["Bring it close to the origin" in message for message in found] == [True] * (distance > 1000)
