@@ -27,6 +27,7 @@ from building import (
     quad,
     scene,
 )
+from cuts import CUTS
 from random_scenes import ball
 from rooms import ROOMS
 
@@ -127,6 +128,10 @@ def messages() -> Iterator[list[str]]:
 
 def prb_edge(max_depth: int, **samples: int) -> dict:
     return {"type": "prb_edge", "max_depth": max_depth, **samples}
+
+
+def upto(max_depth: int) -> dict:
+    return {"type": "direct_edge"} if max_depth == 2 else prb_edge(max_depth)
 
 
 def smooth_cube() -> dict:
@@ -875,6 +880,7 @@ CASES = [
     Case("open_air", open_air, SIDE, 1e-2, spp=128, runs=96, integrator=prb_edge(3)),
     Case("sky_blocker", sky_blocker, BLOCKER_SIDE, 5e-2, spp=256, runs=48),
     *(Case(k, *of, spp=64, runs=12, integrator=prb_edge(4), reference_spp=4096) for k, of in ROOMS.items()),
+    *(Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096) for k, (*of, depth) in CUTS.items()),
 ]
 
 

@@ -625,7 +625,20 @@ def _squares(images: np.ndarray) -> np.ndarray:
 
 
 def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES) -> Comparison:
-    """Compare a scene's derivative with finite differences, with more samples until the answer is clear."""
+    """Compare a scene's derivative with finite differences, with more samples until the answer is clear.
+
+    Scenes that do not agree in the end are compared once more, over a tenth of the step: a lamp that comes into the
+    frame within a step, say, is no part of the derivative.
+    """
+    row = _compare(seed, stages, STEP)
+    if row.agrees or row.raised or not row.finite or len(stages) < len(STAGES):
+        return row
+    again = _compare(seed, stages[-1:], STEP / 10)
+    again.seconds += row.seconds
+    return again if again.agrees and again.error < 0.1 else row
+
+
+def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float) -> Comparison:
     start, row = time.time(), Comparison(seed, "")
     try:
         # Finite differences at the origin, where rays start close to surfaces, and single precision tells most.
@@ -637,11 +650,11 @@ def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES) -> Comparis
         for row.stage, (references, derivatives) in enumerate(stages):
             while len(reference) < references:
                 images = []
-                for θ in (STEP, -STEP):
+                for θ in (step, -step):
                     still.move(mi.Float(θ))
                     image = mi.render(still.scene, integrator=path, spp=REFERENCE_SPP, seed=len(reference))
                     images.append(np.array(image, np.float64))
-                reference.append((images[0] - images[1]) / (2 * STEP))
+                reference.append((images[0] - images[1]) / (2 * step))
             while len(derivative) < derivatives:
                 θ = dr.opaque(mi.Float, 0)  # Dr.Jit 1.5 gives a literal zero the width of what it is multiplied with
                 dr.enable_grad(θ)

@@ -21,18 +21,15 @@ import numpy as np
 
 from rimlight.edge_sampling.geometry.device_edges import line_of_sight
 from rimlight.edge_sampling.geometry.edges import Edges
-from rimlight.edge_sampling.geometry.meshes import Geometry
+from rimlight.edge_sampling.geometry.meshes import Geometry, lets_light_through
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
-from rimlight.edge_sampling.rays import lift
+from rimlight.edge_sampling.rays import behind
 
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
 from .lune import Lune
 from .tracer import Tracer
-
-#: How far beside the edges of meshes that light goes through to look, in units of the offset of rays that start there.
-BEHIND = 8
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ class FilmBoundary:
         """Which edges, cuts, horizons and pieces of curves, in this order, are on a mesh that light goes through? None
         if it goes through none of the meshes."""
         meshes = geometry.meshes
-        transmits = [m.bsdf() is not None and bool(m.bsdf().flags() & mi.BSDFFlags.Transmission) for m in meshes]
+        transmits = [lets_light_through(m) for m in meshes]
         if not any(transmits):
             return None
         counts = [*(m.vertex_count() for m in meshes), geometry.line_vertices]
@@ -228,9 +225,7 @@ class FilmBoundary:
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = 8 * ulp * largest
         if self.transmit is not None:
-            # Rays start so far from a surface: beside the edge of glass, beyond the face on the other side.
-            behind = BEHIND * lift(scene, p)
-            in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind, 0)
+            in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind(scene, p), 0)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film

@@ -25,7 +25,6 @@ from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
 from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic, resample
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Lobe, View
-from rimlight.edge_sampling.geometry.device_edges import beside_edge
 from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals
 from rimlight.edge_sampling.parametrisation import Vicinity, material_point
 from rimlight.edge_sampling.rays import spawn_ray
@@ -246,7 +245,7 @@ class ShadingBoundary:
             near = 1 - vicinity.far(dr.square(distance))
             active &= (outward != 0) | (near > 0)
             n_dl = dr.select(active, n_dl, 0)
-            aside = beside_edge(p, x)
+            aside = self.silhouettes.beside(scene, sample, p, x)
 
             def look(side, active, slack=1):
                 """What is seen beside the edge, unless something before the edge hides it."""
@@ -263,8 +262,7 @@ class ShadingBoundary:
             active &= ~hidden & (past | own)
             L = mi.Spectrum(0)
             if self.emission:
-                found_too = ~mi.Bool(outline.is_line)
-                L += self._emitted(tracer, point, ray, y, ω, pdf, active & past & emission, light, found_too)
+                L += self._emitted(tracer, point, ray, y, ω, pdf, active & past & emission, light, ~outline.is_line)
             valid = active & y.is_valid()
             if tracer.scatters(2):
                 again = sampler.clone()

@@ -9,8 +9,10 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.geometry.curves import PIECES, Curves
+from rimlight.edge_sampling.geometry.device_edges import beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
-from rimlight.edge_sampling.geometry.meshes import Geometry
+from rimlight.edge_sampling.geometry.meshes import Geometry, lets_light_through
+from rimlight.edge_sampling.rays import behind
 
 from .edge_tree import EdgeTree
 from .sampling import EdgeSample, sample_edge
@@ -45,7 +47,7 @@ class OutlinePoint:
     p: mi.Point3f
     tangent: mi.Vector3f
     inwards: tuple[mi.Vector3f, mi.Vector3f]
-    is_line: mi.Bool | bool = False
+    is_line: mi.Bool
 
     @property
     def normals(self) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -73,7 +75,7 @@ class Silhouettes:
     Moving edges are a group of their own, so that viewers that stand still need not look at the others.
     """
 
-    _NUMBERS = ("count", "groups", "centre", "_first_line")
+    _NUMBERS = ("count", "groups", "centre", "_first_line", "_transmit")
     DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
@@ -89,6 +91,9 @@ class Silhouettes:
         #: Number of groups of edges.
         self.groups = len(groups)
         self.tree = EdgeTree(geometry, edges, groups) if groups else None
+        transmit = np.array([lets_light_through(m) for m in geometry.meshes])
+        #: Which edges are on meshes that light goes through? None if it goes through no mesh.
+        self._transmit = mi.Bool(transmit[edges.mesh].any(1) | edges.is_line) if transmit.any() and groups else None
         self.curves = Curves(geometry.analytic) if geometry.analytic else None
         self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
 
@@ -189,6 +194,14 @@ class Silhouettes:
             return mi.Bool(False)
         return (sample.edge < self.count) & self.tree.device_edges.is_smooth(dr.minimum(sample.edge, self.count - 1))
 
+    def beside(self, scene: mi.Scene, sample: EdgeSample, p: mi.Point3f, x: mi.Point3f) -> mi.Float:
+        """How far beside a point p that was sampled to look from x: scene units."""
+        aside = beside_edge(p, x)
+        if self._transmit is None:
+            return aside
+        through = dr.gather(mi.Bool, self._transmit, sample.edge, sample.edge < self.count)
+        return aside + dr.select(through, behind(scene, p), 0)
+
     def point(
         self, placement: Placement, sample: EdgeSample, eye: mi.Point3f, far: mi.Bool | bool = False
     ) -> OutlinePoint:
@@ -201,9 +214,8 @@ class Silhouettes:
             p = dr.lerp(a, b, sample.t)
             with dr.suspend_grad():
                 inwards = tuple(dr.detach(o - p) for o in edges.opposite(placement.positions, index))
-                point = OutlinePoint(p, dr.detach(b - a), inwards)
-                if self.lines is not None:
-                    point.is_line = index >= self._first_line
+                is_line = index >= self._first_line if self.lines is not None else mi.Bool(False)
+                point = OutlinePoint(p, dr.detach(b - a), inwards, is_line)
             if self.curves is None:
                 return point
         piece = sample.edge - self.count
@@ -211,7 +223,8 @@ class Silhouettes:
             piece = dr.select(on_edge, 0, piece)
         c = self.curves.point(placement.frames, piece, sample.t, eye, far)
         # Where there is none, both sides seem to have a face.
-        on_curve = OutlinePoint(c.p, c.tangent, (c.inwards, dr.select(c.valid, c.inwards, -c.inwards)))
+        inwards = (c.inwards, dr.select(c.valid, c.inwards, -c.inwards))
+        on_curve = OutlinePoint(c.p, c.tangent, inwards, mi.Bool(False))
         if self.tree is None:
             return on_curve
         choose = lambda x, y: dr.select(on_edge, x, y)

@@ -34,8 +34,6 @@ VERTICES = 4
 #: Least number of pairs for which there is space.
 LEAST_SPACE = 64
 
-Triangle = list[mi.Point3f]
-
 
 @dataclass(frozen=True)
 class _Walked:
@@ -235,7 +233,7 @@ class Intersections:
         return Edges(*(both(f.name) for f in fields(Edges)))
 
 
-def common_line(first: Triangle, second: Triangle) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
+def common_line(first: list[mi.Point3f], second: list[mi.Point3f]) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
     """Lower and upper end of the piece of a line that two triangles have in common; do they cut each other? Detached.
 
     The same for the triangles in another order, but for rounding. Triangles that only touch do not cut each other.
@@ -260,7 +258,7 @@ def common_line(first: Triangle, second: Triangle) -> tuple[mi.Point3f, mi.Point
 
 
 def cut_by_plane(
-    corners: Triangle, height: list[mi.Float], slack: mi.Float | float = 0.0
+    corners: list[mi.Point3f], height: list[mi.Float], slack: mi.Float | float = 0.0
 ) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
     """Where a plane cuts through a triangle: two points of its sides; and does it?
 
@@ -282,12 +280,12 @@ def cut_by_plane(
     return points[0], points[1], crosses
 
 
-def _normal(triangle: Triangle) -> mi.Vector3f:
+def _normal(triangle: list[mi.Point3f]) -> mi.Vector3f:
     a, b, c = triangle
     return dr.normalize(dr.cross(b - a, c - a))
 
 
-def _follow(p: mi.Point3f, first: Triangle, second: Triangle, active: mi.Bool) -> mi.Point3f:
+def _follow(p: mi.Point3f, first: list[mi.Point3f], second: list[mi.Point3f], active: mi.Bool) -> mi.Point3f:
     """The point p of the line, attached: it stays in both planes."""
     normals, heights = [], []
     for triangle in (first, second):

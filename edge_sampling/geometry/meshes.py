@@ -163,6 +163,11 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     return not mesh.has_vertex_texcoords() and any(_has_place(o) for o in objects)
 
 
+def lets_light_through(shape: Any) -> bool:
+    """Does light go through a surface, refracted, scattered, or as it is?"""
+    return shape.bsdf() is not None and bool(shape.bsdf().flags() & mi.BSDFFlags.Transmission)
+
+
 def has_normal_map(shape: Any) -> bool:
     """Is a shape shaded by other normals than its own, or those of its vertices?"""
     return any(isinstance(o, mi.BSDF) and _is_map(o) for o in objects_below(shape).values())

@@ -1,0 +1,81 @@
+"""Meshes that cut through each other: what `cases.py` has of lines which are no edges."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from building import CUBE_FACES, camera, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
+from rooms import walls
+
+
+def lamp() -> mi.Mesh:
+    return horizontal((0.6, 3, -0.8), 0.6, "lamp", down=True, bsdf=diffuse(0.0), emitter=light(8, 8, 7))
+
+
+def cube(size: float = 0.45, centre=(0.1, 0.25, 0), name: str = "cube", **bsdf: Any) -> mi.Mesh:
+    vertices = size * cube_vertices() + centre
+    return mesh(name, vertices, CUBE_FACES, bsdf=bsdf or diffuse(0.8, 0.5, 0.3))
+
+
+LOOK = ((0.6, 1.6, -3.4), (0.1, 0.2, 0))
+
+
+def sunk_cube() -> mi.Scene:
+    """A turned cube stands a little in the floor."""
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
+    return scene(sensor=camera(*LOOK), cube=cube(), floor=floor, lamp=lamp())
+
+
+def sunk_in_gloss() -> mi.Scene:
+    """The same before a wall, on a floor that reflects it: each surface sees the lines."""
+    gloss = {"type": "roughconductor", "alpha": 0.25}
+    around = {k: v for k, v in walls().items() if k != "floor"}
+    floor = quad((-1, 0, -1), (0, 0, 2), (2, 0, 0), "floor", bsdf=gloss)
+    at = {"centre": (-0.5, 0.2, 0.5), "size": 0.4}
+    bulb = horizontal((0.1, 1.9, -0.2), 0.3, "lamp", down=True, bsdf=diffuse(0.0), emitter=light(14, 12, 10))
+    return scene(sensor=camera((0.9, 1.4, -3.2), (-0.2, 0.6, 0.2)), **around, floor=floor, cube=cube(**at), lamp=bulb)
+
+
+def cut_lamp() -> mi.Scene:
+    """A black board goes through a lamp, of which the floor sees less on one of its sides."""
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
+    shade = horizontal((0.1, 1.2, 0.2), 0.6, "lamp", down=True, bsdf=diffuse(0.0), emitter=light(8, 7, 6))
+    board = quad((0.15, 0.9, -0.7), (0.1, 0.5, 0), (0.1, 0, 1.8), "board", bsdf=diffuse(0.0))
+    return scene(sensor=camera((0.4, 2.0, -3.6), (0, 0.5, 0)), floor=floor, lamp=shade, board=board)
+
+
+def knot() -> mi.Scene:
+    """A mesh that cuts through itself: two cubes that are one mesh."""
+    other = 0.35 * cube_vertices() @ np.diag([1, 1.4, 0.8]) + [0.3, 0.1, -0.2]
+    vertices = np.concatenate([0.4 * cube_vertices(), other])
+    faces = np.concatenate([CUBE_FACES, np.array(CUBE_FACES) + 8])
+    colours = np.repeat([[0.8, 0.4, 0.2], [0.2, 0.5, 0.8]], 8, 0)
+    bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    both = mesh("knot", np.add(vertices, [0, 0.8, 0]), faces, colours=colours, bsdf=bsdf)
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, two_sided=True))
+    return scene(sensor=camera((0.6, 1.6, -3.4), (0.1, 0.7, 0)), knot=both, floor=floor, lamp=lamp())
+
+
+SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0, 0.3]}
+TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
+SINK = {"key": "cube.vertex_positions", "direction": [0, -1, 0]}
+RISE = {"key": "floor.vertex_positions", "direction": [0, 1, 0]}
+CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0]}
+BOARD = {"key": "board.vertex_positions", "direction": [1, 0.2, 0]}
+DEFORM = {"key": "knot.vertex_positions", "direction": [1, 0.3, 0], "vertices": list(range(8))}
+
+#: Of each case: scene, motion, step, max_depth.
+CUTS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
+    "sunk_cube_slides": (sunk_cube, SLIDE, 3e-3, 2),
+    "sunk_cube_turns": (sunk_cube, TURN, 6e-3, 2),
+    "sunk_cube_sinks": (sunk_cube, SINK, 3e-3, 2),
+    "sunk_cube_floor": (sunk_cube, RISE, 3e-3, 2),
+    "sunk_cube_camera": (sunk_cube, CAMERA, 3e-3, 2),
+    "sunk_cube_light": (sunk_cube, SLIDE, 3e-3, 3),
+    "sunk_in_gloss": (sunk_in_gloss, SLIDE, 3e-3, 3),
+    "cut_lamp": (cut_lamp, BOARD, 6e-3, 2),
+    "knot": (knot, DEFORM, 4e-3, 2),
+}

@@ -1,0 +1,171 @@
+"""The lines in which meshes cut through each other: `geometry/intersections.py`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from building import CUBE_FACES, cube_vertices, diffuse, horizontal, mesh, quad, scene
+from random_scenes import ball, torus
+
+from rimlight.edge_sampling import Geometry, Intersections, find_welded_edges
+
+
+def intersections(scene: mi.Scene) -> tuple[Intersections, Geometry]:
+    geometry = Geometry.of(scene)
+    lines = Intersections(scene, geometry, *find_welded_edges(geometry))
+    lines.find(scene, geometry)
+    return lines, geometry
+
+
+def pieces(lines: Intersections, geometry: Geometry) -> np.ndarray:
+    """Lower and upper ends of all lines: (N, 2, 3)."""
+    if not lines.capacity:
+        return np.zeros((0, 2, 3))
+    a, b, *_ = lines.points(geometry.positions())
+    found = np.stack([np.array(a).T, np.array(b).T], 1)
+    assert (found[lines.count :, 0] == found[lines.count :, 1]).all()  # space that is not needed
+    return found[: lines.count]
+
+
+def length(pieces: np.ndarray) -> float:
+    return float(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1).sum())
+
+
+def by_all_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Of triangles (F, 3, 3) and (G, 3, 3), the length of the line that each pair has in common: (F, G)."""
+    found = np.zeros((len(first), len(second)))
+    for i, p in enumerate(first):
+        for j, q in enumerate(second):
+            n, m = np.cross(p[1] - p[0], p[2] - p[0]), np.cross(q[1] - q[0], q[2] - q[0])
+            along = np.cross(n, m)
+            intervals = []
+            for triangle, normal, origin in ((p, m, q[0]), (q, n, p[0])):
+                h = (triangle - origin) @ normal
+                cuts = [
+                    triangle[k] + (triangle[k - 1] - triangle[k]) * h[k] / (h[k] - h[k - 1])
+                    for k in range(3)
+                    if h[k] * h[k - 1] < 0
+                ]
+                intervals.append(sorted(c @ along for c in cuts) if len(cuts) == 2 else (0, 0))
+            lower, upper = max(i[0] for i in intervals), min(i[1] for i in intervals)
+            found[i, j] = max(upper - lower, 0) / max(np.linalg.norm(along), 1e-30)
+    return found
+
+
+def corners(mesh: mi.Mesh) -> np.ndarray:
+    vertices = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3).astype(float)
+    return vertices[np.array(mesh.faces_buffer()).reshape(-1, 3)]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_each_line_counts_once(seed):
+    rng = np.random.default_rng(seed)
+    shapes = []
+    for k in range(3):
+        vertices, _, _, faces = (ball, torus)[k % 2](3 + k)
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        shapes.append(mesh(f"shape{k}", vertices @ turn * 0.8 + rng.uniform(-0.4, 0.4, 3), faces, bsdf=diffuse(0.5)))
+    found = pieces(*intersections(scene(**{s.id(): s for s in shapes})))
+    triangles = [corners(s) for s in shapes]
+    expected = [by_all_pairs(triangles[i], triangles[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    assert length(found) == pytest.approx(sum(e.sum() for e in expected), rel=2e-4)
+    assert len(found) == pytest.approx(sum((e > 1e-4).sum() for e in expected), abs=3)
+
+
+def crossing(turn: float = 0.0) -> dict[str, mi.Mesh]:
+    """Two squares of side 2 that cross in their middle."""
+    c, s = np.cos(turn), np.sin(turn)
+    return {
+        "flat": horizontal((0, 0, 0), 1, "flat", bsdf=diffuse(0.5)),
+        "upright": quad((-c, -1, -s), (2 * c, 0, 2 * s), (0, 2, 0), "upright", bsdf=diffuse(0.5)),
+    }
+
+
+@pytest.mark.parametrize("turn", [0.3, 1.0, 2.2])
+def test_lines_end_where_one_of_the_meshes_does(turn):
+    found = pieces(*intersections(scene(**crossing(turn))))
+    assert length(found) == pytest.approx(2, rel=1e-5)
+    assert np.abs(found[..., 1]).max() < 1e-6
+    assert np.linalg.norm(found, axis=2).max() == pytest.approx(1, abs=1e-5)
+
+
+def test_what_only_touches_does_not_cut():
+    upright = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (0, 1) for x in (-0.5, 0.5)])
+    box = mesh("box", upright, CUBE_FACES, bsdf=diffuse(0.5))
+    beside = mesh("beside", np.add(upright, [1, 0, 0.2]), CUBE_FACES, bsdf=diffuse(0.5))
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5))
+    lines, _ = intersections(scene(box=box, beside=beside, floor=floor))
+    assert lines.meshes == (0, 1, 2)  # their boxes touch
+    assert lines.capacity == lines.count == 0
+
+
+def test_a_mesh_that_cuts_through_itself():
+    vertices = np.concatenate([cube_vertices(), np.add(cube_vertices(), [0.5, 0.3, 0.2])])
+    both = mesh("both", vertices, [*CUBE_FACES, *(np.array(CUBE_FACES) + 8)], bsdf=diffuse(0.5))
+    lines, geometry = intersections(scene(both=both))
+    one, other = np.split(corners(both), 2)
+    assert length(pieces(lines, geometry)) == pytest.approx(by_all_pairs(one, other).sum(), rel=1e-4)
+
+
+def test_lines_follow_the_planes_of_both_meshes():
+    """Finite differences of the ends, across the line: along it, they may slide."""
+    there = scene(
+        a=mesh("a", cube_vertices(), CUBE_FACES, bsdf=diffuse(0.5)),
+        b=mesh("b", 0.8 * cube_vertices() @ np.diag([1, -1, -1]) + [0.7, 0.4, 0.1], CUBE_FACES, bsdf=diffuse(0.5)),
+    )
+    lines, geometry = intersections(there)
+    rng = np.random.default_rng(1)
+    start = np.array(geometry.positions(), float)
+    velocity = rng.normal(size=len(start)) * 0.3
+
+    def ends(θ: float) -> np.ndarray:
+        a, b, *_ = lines.points(mi.Float((start + θ * velocity).astype(np.float32)))
+        return np.stack([np.array(a).T, np.array(b).T], 1)[: lines.count].astype(float)
+
+    θ = mi.Float(0)
+    dr.enable_grad(θ)
+    attached = lines.points(mi.Float(start.astype(np.float32)) + θ * mi.Float(velocity.astype(np.float32)))[:2]
+    dr.forward(θ)
+    moved = np.stack([np.array(dr.grad(p)).T for p in attached], 1)[: lines.count].astype(float)
+    h = 1e-3
+    differences = (ends(h) - ends(-h)) / (2 * h)
+    at = ends(0)
+    long = np.linalg.norm(at[:, 1] - at[:, 0], axis=1) > 0.05
+    along = (at[:, 1] - at[:, 0]) / np.linalg.norm(at[:, 1] - at[:, 0], axis=1)[:, None]
+    across = lambda v: v - (v * along[:, None]).sum(2, keepdims=True) * along[:, None]
+    assert long.sum() > 5
+    np.testing.assert_allclose(across(moved)[long], across(differences)[long], atol=5e-3)
+
+
+def test_lines_are_found_again_when_meshes_move():
+    there = scene(**crossing(1.0))
+    lines, geometry = intersections(there)
+    assert lines.count > 0
+    params = mi.traverse(there)
+    still = mi.Float(params["upright.vertex_positions"])
+    assert not lines.find(there, geometry)
+    params["upright.vertex_positions"] = still + mi.Float([0, 5, 0] * 4)
+    params.update()
+    assert lines.find(there, geometry)  # other meshes may cut: none
+    assert lines.count == 0
+    params["upright.vertex_positions"] = still
+    params.update()
+    assert lines.find(there, geometry)
+    assert lines.count > 0
+
+
+def test_lines_are_edges_after_all_others():
+    there = scene(**crossing(0.3))
+    lines, geometry = intersections(there)
+    edges, _ = find_welded_edges(geometry)
+    both = lines.as_edges(edges, 8)
+    assert both.is_line.sum() == lines.capacity
+    assert not both.is_line[: len(edges)].any()
+    extended = replace(geometry, lines=lines)
+    assert dr.width(extended.positions()) == 3 * (8 + lines.vertices)
+    assert len(extended.host_positions()) == 8 + lines.vertices == both.vertices.max() + 1 + 2 * lines.capacity
+    assert dr.width(extended.normals()) == 3 * (8 + lines.vertices)
