@@ -31,6 +31,9 @@ MOST_FACES = 1024
 #: Vertices that stand for the line of one pair: its two ends, and a point on each side of it.
 VERTICES = 4
 
+#: Corners of the two triangles of a pair.
+CORNERS = 6
+
 #: Least number of pairs for which there is space.
 LEAST_SPACE = 64
 
@@ -103,7 +106,7 @@ class Intersections:
             count = int(ends[-1])
             if count > self.capacity:
                 self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
-            found = [dr.zeros(mi.UInt32, max(count, 1)) for _ in range(6)]
+            found = [dr.zeros(mi.UInt32, max(count, 1)) for _ in range(CORNERS)]
             if count:
                 self._walk(scene, positions, walked, into=found, start=ends - counts)
             self._keep(found, count)
@@ -115,7 +118,7 @@ class Intersections:
         if self.capacity:
             slot = dr.arange(mi.UInt32, self.capacity)
             used = slot < dr.opaque(mi.UInt32, count)
-            self.corners = [dr.gather(mi.UInt32, f, slot, used) for f in found or [dr.zeros(mi.UInt32, 1)] * 6]
+            self.corners = [dr.gather(mi.UInt32, f, slot, used) for f in found or [dr.zeros(mi.UInt32, 1)] * CORNERS]
             dr.eval(self.corners)
 
     def _edges_of(self, meshes: tuple[int, ...]) -> _Walked:

@@ -19,6 +19,7 @@ from rimlight.edge_sampling import (
     objects_below,
     t_junctions,
 )
+from rimlight.edge_sampling.geometry.cut_curves import cut_curves
 from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, has_normal_map, is_smooth, vertices
 from rimlight.edge_sampling.rays import extent
 from rimlight.transport.paths import Depths
@@ -154,6 +155,14 @@ def outlines(scene: mi.Scene, geometry: Geometry, edges: Edges, moving: Moving) 
         limits.append(
             f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid). Replace "
             "them by meshes."
+        )
+    moves = lambda s: s in moving.on_film
+    cut = sorted({tuple(sorted((a.id(), b.id()))) for a, b in cut_curves(scene, geometry) if moves(a) or moves(b)})
+    if cut:
+        pairs = ", ".join(f'"{a}" and "{b}"' for a, b in cut)
+        limits.append(
+            "the derivative lacks the curves in which spheres, disks and cylinders cut through other shapes: "
+            f"{pairs}. Replace them by meshes."
         )
     # Of edges that lie on one another, those of what stands still have no velocity, and do not count.
     twice = sorted(

@@ -219,3 +219,17 @@ def test_scenes_far_from_the_origin(distance):
     sensor = cases.camera((distance, 0, -5), (distance, 0, 0))
     found = said(cases.scene(sensor=sensor, floor=floor, sky=cases.constant()), "floor.vertex_positions")
     assert ["Bring it close to the origin" in message for message in found] == [True] * (distance > 1000)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk"])
+@pytest.mark.parametrize("height", [-0.3, 0.0, 0.2])
+def test_analytic_shapes_that_cut_others_are_warned_about(kind, height):
+    """Those that only touch are not."""
+    T = mi.ScalarTransform4f
+    turn = T().rotate([1, 0, 0], 90) if kind == "disk" else T().rotate([1, 0, 0], -90) if kind == "cylinder" else T()
+    lowest = {"sphere": 0.5, "cylinder": 0.0, "disk": 0.5}[kind]
+    place = T().translate([0.1, lowest + height, 0.2]) @ (turn if kind != "disk" else T()) @ T().scale(0.5)
+    thing = {"type": kind, "to_world": place, "bsdf": cases.diffuse(0.5, two_sided=True)}
+    floor = cases.horizontal((0, 0, 0), 2, "floor", bsdf=cases.diffuse(0.5, two_sided=True))
+    found = said(cases.scene(sensor=cases.camera(), thing=thing, floor=floor, sky=cases.constant()), "thing.to_world")
+    assert any("cut through other shapes" in message and '"floor"' in message for message in found) == (height < 0)

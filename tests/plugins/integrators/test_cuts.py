@@ -1,0 +1,54 @@
+"""Derivatives of meshes that cut through each other. Their references are in `test_derivatives.py`."""
+
+from __future__ import annotations
+
+import cuts
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from frozen import Step, assert_same, losses_and_gradients, numbers
+
+from rimlight.checks import Motion, derivative_image
+
+INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 3}}
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+@pytest.mark.parametrize("key", ["cube.vertex_positions", "floor.vertex_positions", "sensor.to_world"])
+def test_gradients_are_those_of_forward_mode(name, key):
+    scene, made = cuts.sunk_cube(), mi.load_dict(INTEGRATORS[name])
+    motion = Motion(scene, key, direction=[1, 0.4, 0.2])
+    forward = np.array(derivative_image(scene, made, motion, spp=16, seed=3), float)
+    weight = np.random.default_rng(0).uniform(0.5, 1, forward.shape)
+    θ = mi.Float(0)
+    dr.enable_grad(θ)
+    motion.apply(θ)
+    made.render_backward(scene, motion.params, mi.TensorXf(weight.astype(np.float32)), seed=3, spp=16)
+    dr.enqueue(dr.ADMode.Backward, θ)
+    dr.traverse(dr.ADMode.Backward)
+    expected = (weight * forward).sum()
+    assert abs(dr.grad(θ)[0] - expected) < 1e-3 * np.abs(weight * forward).sum()
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_frozen_functions(name):
+    scene, made, key = cuts.sunk_cube(), mi.load_dict(INTEGRATORS[name]), "cube.vertex_positions"
+    initial = numbers(mi.traverse(scene)[key])
+    results = [losses_and_gradients(step, scene, made, key, initial) for step in (Step().frozen(), Step())]
+    assert_same(*results)
+
+
+def test_lines_are_not_kept_when_meshes_part():
+    """An integrator that was used before gives what a new one does, whether meshes part or meet."""
+    scene, used = cuts.sunk_cube(), mi.load_dict(INTEGRATORS["direct_edge"])
+    params, key = mi.traverse(scene), "cube.vertex_positions"
+    still = mi.Float(params[key])
+    for height in (0, 0.8, 0.1, 0):
+        params[key] = still + mi.Float([0, height, 0] * 8)
+        params.update()
+        motion = Motion(scene, key, direction=[1, 0, 0.3])
+        new = mi.load_dict(INTEGRATORS["direct_edge"])
+        a, b = (np.array(derivative_image(scene, made, motion, spp=512, seed=1), float) for made in (used, new))
+        assert (a * b).sum() / (b * b).sum() == pytest.approx(1, abs=0.01)
+        assert np.abs(a - b).sum() < 0.05 * np.abs(b).sum()  # other samples: 2 %
