@@ -125,11 +125,12 @@ class Generator:
     """Makes one scene. The same seed makes the same one, but for the sampler of its sensor.
 
     home : at the origin, and one scene unit large, whatever size and place the seed says? The image is the same.
+    cut : do meshes stand in the floor, and in each other? Then none of them is a lamp.
     """
 
-    def __init__(self, seed: int, sampler: str, home: bool = False):
+    def __init__(self, seed: int, sampler: str, home: bool = False, cut: bool = False):
         self.rng = np.random.default_rng([seed, 14])
-        self.sampler, self.home = sampler, home
+        self.sampler, self.home, self.cut = sampler, home, cut
         self.objects: dict[str, Any] = {"type": "scene"}
         self.labels: list[str] = []
         self.lights: list[np.ndarray] = []
@@ -354,12 +355,15 @@ class Generator:
         name = f"thing{i}"
         centre = [[-0.9, 0.5, 0], [0.9, 0.7, -0.3], [0, 1.6, 0.4]][i] + self.rng.uniform(-0.1, 0.1, 3)
         size, q = self.uniform(0.35, 0.55), self.rotation()
+        if self.cut:
+            analytic = kind in ("sphere", "cylinder", "disk")
+            centre = centre * [1, 1, 1] + [0, 1.4, 0] if analytic else centre * [0.4, 0, 1] + [0, 0.5 * size - 0.4, 0]
         closed = kind not in ("quad", "half", "disk", "cylinder", "needle")
         uv = kind not in ("sphere", "cylinder", "disk", "tetra") and self.chance(0.6)
         material, bsdf = self.bsdf(uv, closed and kind != "torus")
         if not closed:
             bsdf = self.two_sided(bsdf) if material != "roughdielectric" else bsdf
-        lamp = self.chance(0.15)
+        lamp = self.chance(0.15) and not self.cut
         emitter = self.emitter(0.5, 3) if lamp else None
         smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
         smooth &= not lamp or kind == "fine"  # what coarse lamps light is off by some per cent, with a warning
@@ -536,8 +540,8 @@ class Generator:
         return change
 
 
-def make(seed: int, sampler: str = "independent", home: bool = False) -> RandomScene:
-    return Generator(seed, sampler, home).make()
+def make(seed: int, sampler: str = "independent", home: bool = False, cut: bool = False) -> RandomScene:
+    return Generator(seed, sampler, home, cut).make()
 
 
 # ---------------------- Comparison ----------------------
@@ -624,25 +628,25 @@ def _squares(images: np.ndarray) -> np.ndarray:
     return sums
 
 
-def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES) -> Comparison:
+def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES, cut: bool = False) -> Comparison:
     """Compare a scene's derivative with finite differences, with more samples until the answer is clear.
 
     Scenes that do not agree in the end are compared once more, over a tenth of the step: a lamp that comes into the
     frame within a step, say, is no part of the derivative.
     """
-    row = _compare(seed, stages, STEP)
+    row = _compare(seed, stages, STEP, cut)
     if row.agrees or row.raised or not row.finite or len(stages) < len(STAGES):
         return row
-    again = _compare(seed, stages[-1:], STEP / 10)
+    again = _compare(seed, stages[-1:], STEP / 10, cut)
     again.seconds += row.seconds
     return again if again.agrees and again.error < 0.1 else row
 
 
-def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float) -> Comparison:
+def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, cut: bool) -> Comparison:
     start, row = time.time(), Comparison(seed, "")
     try:
         # Finite differences at the origin, where rays start close to surfaces, and single precision tells most.
-        still, moving = make(seed, "multijitter", home=True), make(seed)
+        still, moving = make(seed, "multijitter", home=True, cut=cut), make(seed, cut=cut)
         row.label = still.label
         path = mi.load_dict({"type": "path", "max_depth": still.max_depth, "rr_depth": 1000})
         integrator = mi.load_dict(moving.integrator)
@@ -678,6 +682,7 @@ def main() -> None:
     parser.add_argument("--only", type=int, nargs="*", help="these seeds")
     parser.add_argument("--quick", action="store_true", help="the first stage only")
     parser.add_argument("--thorough", action="store_true", help="the last stage at once")
+    parser.add_argument("--cut", action="store_true", help="meshes stand in the floor, and in each other")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, help="rows as JSON, one a line; seeds that it has are not repeated")
     args = parser.parse_args()
@@ -688,7 +693,8 @@ def main() -> None:
         known = {json.loads(line)["seed"] for line in args.out.read_text().splitlines()}
         seeds = [s for s in seeds if s not in known]
     if args.processes > 1:
-        options = [o for o, given in (("--quick", args.quick), ("--thorough", args.thorough)) if given]
+        flags = (("--quick", args.quick), ("--thorough", args.thorough), ("--cut", args.cut))
+        options = [o for o, given in flags if given]
         options += ["--out", str(args.out)] if args.out else []
         parts = [seeds[k :: args.processes] for k in range(args.processes)]
         command = [sys.executable, __file__, *options, "--only"]
@@ -697,7 +703,7 @@ def main() -> None:
     stages = STAGES[:1] if args.quick else STAGES[-1:] if args.thorough else STAGES
     bad = []
     for seed in seeds:
-        row = compare(seed, stages)
+        row = compare(seed, stages, args.cut)
         print(row, flush=True)
         bad += [] if row.agrees else [seed]
         if args.out:

@@ -167,7 +167,7 @@ def test_all_that_is_read_is_known_to_frozen_functions():
         (film.outlines.edges, set()),
         (boundaries.shadows, set()),
         (boundaries.shadows.lights, set()),
-        (shading, {"geometry"}),
+        (shading, {"geometry", "cut_lamps"}),
         (shading.silhouettes, {"geometry"}),
         (shading.silhouettes.tree, {"geometry", "node_offsets", "leaf_offsets"}),
         (shading.silhouettes.curves, set()),
