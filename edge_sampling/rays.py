@@ -18,8 +18,13 @@ import numpy as np
 #: Largest offset in small scenes, relative to their diagonal, in RayEpsilon.
 PART = 0.25
 
-#: How far beside the edges of meshes that light goes through to look, in units of the offset of rays that start there.
+#: How far beside the edges of meshes that light goes through to look, in units of the offset of rays that start there:
+#: closer, rays through the mesh start beyond the face on the other side.
 BEHIND = 8
+
+#: And beside lines in which meshes cut through each other: closer, rays start below the other surface where that
+#: overhangs.
+BESIDE_LINE = 2
 
 #: Least offset relative to the largest coordinate, in RayEpsilon: 64 units in the last place.
 LEAST = 64 / 1500
@@ -51,12 +56,6 @@ def lift(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
     if _is_small(scene):
         usual = dr.maximum(dr.minimum(usual, PART * _size(scene)), LEAST * reach)
     return usual * mi.math.RayEpsilon
-
-
-def behind(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
-    """How far beside a point p of an edge to look at a mesh that light goes through: rays through it start so far from
-    the face that they meet that, closer to the edge, they would start beyond the face on the other side."""
-    return BEHIND * lift(scene, p)
 
 
 def _start(scene, si, d) -> mi.Point3f:

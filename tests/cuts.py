@@ -7,7 +7,8 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from building import CUBE_FACES, camera, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
+from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
+from random_scenes import ball
 from rooms import walls
 
 
@@ -39,6 +40,15 @@ def sunk_in_gloss() -> mi.Scene:
     return scene(sensor=camera((0.9, 1.4, -3.2), (-0.2, 0.6, 0.2)), **around, floor=floor, cube=cube(**at), lamp=bulb)
 
 
+def sunk_ball() -> mi.Scene:
+    """A smooth-shaded ball, less than half of it in the floor, which it overhangs: under a sky, and a lamp."""
+    vertices, normals, _, faces = ball(12)
+    thing = mesh("ball", 0.5 * vertices + [0.1, 0.2, 0], faces, normals=True, bsdf=diffuse(0.8, 0.5, 0.3))
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
+    bulb = {"type": "point", "position": [0.6, 3, -1.5], "intensity": 10.0}
+    return scene(sensor=camera(*LOOK), ball=thing, floor=floor, bulb=bulb, sky=constant(0.5))
+
+
 def cut_lamp() -> mi.Scene:
     """A black board goes through a lamp, of which the floor sees less on one of its sides."""
     floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
@@ -64,6 +74,7 @@ TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
 SINK = {"key": "cube.vertex_positions", "direction": [0, -1, 0]}
 RISE = {"key": "floor.vertex_positions", "direction": [0, 1, 0]}
 CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0]}
+BALL = {"key": "ball.vertex_positions", "direction": [0.77, 0.5, -0.3]}
 BOARD = {"key": "board.vertex_positions", "direction": [1, 0.2, 0]}
 DEFORM = {"key": "knot.vertex_positions", "direction": [1, 0.3, 0], "vertices": list(range(8))}
 
@@ -76,6 +87,7 @@ CUTS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "sunk_cube_camera": (sunk_cube, CAMERA, 3e-3, 2),
     "sunk_cube_light": (sunk_cube, SLIDE, 3e-3, 3),
     "sunk_in_gloss": (sunk_in_gloss, SLIDE, 3e-3, 3),
+    "sunk_ball": (sunk_ball, BALL, 4e-3, 2),
     "cut_lamp": (cut_lamp, BOARD, 6e-3, 2),
     "knot": (knot, DEFORM, 4e-3, 2),
 }

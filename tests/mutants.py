@@ -196,13 +196,13 @@ MUTANTS = [
     mutant(
         "film boundary: looks as near beside glass as beside other meshes",
         FILM,
-        "in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind, 0)",
+        "in_world += dr.gather(mi.Float, self.farther, index) * lift(scene, p)",
         "pass",
     ),
     mutant(
         "edges from points: seen from the surface, not from where rays start",
         SHADING,
-        "lift = si.spawn_ray(towards).o - si.p",
+        "lift = spawn_ray(scene, si, towards).o - si.p",
         "lift = 0 * towards",
     ),
     # ---------------------- Chains ----------------------

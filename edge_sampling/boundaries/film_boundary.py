@@ -24,7 +24,7 @@ from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_light_through
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
-from rimlight.edge_sampling.rays import behind
+from rimlight.edge_sampling.rays import BEHIND, BESIDE_LINE, lift
 
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
@@ -87,29 +87,29 @@ class FilmBoundary:
         smooth-shaded mesh, but not behind the next, and what is seen jumps at the edge (see `face_planes.py`).
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("outlines", "lights", "transmit"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("outlines", "lights", "farther"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights, *, soft: bool):
         self.lights = lights
         self.outlines = FilmOutlines(geometry, edges, moving, soft=soft)
-        self.transmit = self._transmitting(geometry)
+        self.farther = self._farther(geometry)
 
     @property
     def edge_count(self) -> int:
         """Number of edges, and of pieces of curves."""
         return self.outlines.counts[0] + self.outlines.counts[3]
 
-    def _transmitting(self, geometry: Geometry) -> mi.Bool | None:
-        """Which edges, cuts, horizons and pieces of curves, in this order, are on a mesh that light goes through? None
-        if it goes through none of the meshes."""
+    def _farther(self, geometry: Geometry) -> mi.Float | None:
+        """How much farther beside edges, cuts, horizons and pieces of curves, in this order, to look than rounding
+        asks for: in units of the offset of rays; None: nowhere."""
         meshes = geometry.meshes
         transmits = [lets_light_through(m) for m in meshes]
-        if not any(transmits):
+        if not any(transmits) and not geometry.line_vertices:
             return None
         counts = [*(m.vertex_count() for m in meshes), geometry.line_vertices]
-        vertex = np.repeat([*transmits, True], counts)  # light may go through one of the meshes that cut
-        on_curves = np.zeros(self.outlines.counts[3], bool)
-        return mi.Bool(np.concatenate([vertex[self.outlines.first_vertices], on_curves]))
+        vertex = np.repeat([*(BEHIND * t for t in transmits), BESIDE_LINE], counts)
+        on_curves = np.zeros(self.outlines.counts[3])
+        return mi.Float(np.float32(np.concatenate([vertex[self.outlines.first_vertices], on_curves])))
 
     def sample(
         self,
@@ -224,8 +224,8 @@ class FilmBoundary:
         ulp = dr.epsilon(mi.Float) * 2
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = 8 * ulp * largest
-        if self.transmit is not None:
-            in_world += dr.select(dr.gather(mi.Bool, self.transmit, index), behind(scene, p), 0)
+        if self.farther is not None:
+            in_world += dr.gather(mi.Float, self.farther, index) * lift(scene, p)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film

@@ -12,7 +12,7 @@ from rimlight.edge_sampling.geometry.curves import PIECES, Curves
 from rimlight.edge_sampling.geometry.device_edges import beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_light_through
-from rimlight.edge_sampling.rays import behind
+from rimlight.edge_sampling.rays import BEHIND, BESIDE_LINE, lift
 
 from .edge_tree import EdgeTree
 from .sampling import EdgeSample, sample_edge
@@ -75,7 +75,7 @@ class Silhouettes:
     Moving edges are a group of their own, so that viewers that stand still need not look at the others.
     """
 
-    _NUMBERS = ("count", "groups", "centre", "_first_line", "_transmit")
+    _NUMBERS = ("count", "groups", "centre", "_first_line", "_farther")
     DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
@@ -92,8 +92,9 @@ class Silhouettes:
         self.groups = len(groups)
         self.tree = EdgeTree(geometry, edges, groups) if groups else None
         transmit = np.array([lets_light_through(m) for m in geometry.meshes])
-        #: Which edges are on meshes that light goes through? None if it goes through no mesh.
-        self._transmit = mi.Bool(transmit[edges.mesh].any(1) | edges.is_line) if transmit.any() and groups else None
+        far = np.where(edges.is_line, BESIDE_LINE, BEHIND * transmit[edges.mesh].any(1))
+        #: How much farther beside edges to look than rounding asks for, in units of the offset of rays; None: nowhere.
+        self._farther = mi.Float(np.float32(far)) if far.any() else None
         self.curves = Curves(geometry.analytic) if geometry.analytic else None
         self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
 
@@ -197,10 +198,9 @@ class Silhouettes:
     def beside(self, scene: mi.Scene, sample: EdgeSample, p: mi.Point3f, x: mi.Point3f) -> mi.Float:
         """How far beside a point p that was sampled to look from x: scene units."""
         aside = beside_edge(p, x)
-        if self._transmit is None:
+        if self._farther is None:
             return aside
-        through = dr.gather(mi.Bool, self._transmit, sample.edge, sample.edge < self.count)
-        return aside + dr.select(through, behind(scene, p), 0)
+        return aside + dr.gather(mi.Float, self._farther, sample.edge, sample.edge < self.count) * lift(scene, p)
 
     def point(
         self, placement: Placement, sample: EdgeSample, eye: mi.Point3f, far: mi.Bool | bool = False
