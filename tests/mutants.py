@@ -31,6 +31,7 @@ TESTS = (
     "direct_edge",
     "prb_edge",
     "random_scenes",
+    "aov_edge",
 )
 FOLDER = "tests/plugins/integrators"
 
@@ -247,6 +248,25 @@ MUTANTS = [
         SHADING,
         "return value + faces * edge if tracer.scatters(2) else value",
         "return value",
+    ),
+    # ---------------------- Channels besides light ----------------------
+    mutant(
+        "channels: what a ray meets follows the surface",
+        "plugins/transport/channels.py",
+        "si = seen_by_camera(ray, pi, active, attached=attached)",
+        "si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)",
+    ),
+    mutant(
+        "channels: edges of smooth meshes left out",
+        "plugins/integrators/_channel_search.py",
+        '"soft": "geo_normal" in self.kinds',
+        '"soft": False',
+    ),
+    mutant(
+        "channels: seams of texture coordinates left out",
+        "plugins/integrators/_channel_search.py",
+        '"seams": "uv" in self.kinds',
+        '"seams": False',
     ),
 ]
 
