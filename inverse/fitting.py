@@ -481,7 +481,7 @@ class Run:
             before, after = (self.renderer.image(v, task) for v in (self._values(self.start), values))
             target, weight = view.picture()
             views.append(ViewOfFit(before, after, target, weight))
-            compared = [losses.measures(image, target, weight) for image in (before, after)]
+            compared = [losses.measures(image, target, weight, view.shows_light) for image in (before, after)]
             if self.problem.loss.norm == "classifier":
                 said = [classifier.probabilities(self.problem.loss, image) for image in (before, after)]
                 compared = [

@@ -90,12 +90,15 @@ def root_mean_square(difference: np.ndarray, weight: np.ndarray) -> float:
     return float(np.sqrt(np.sum(weight * np.square(difference).mean(2)) / max(weight.sum(), 1e-12)))
 
 
-def measures(image: np.ndarray, target: np.ndarray, weight: np.ndarray) -> dict[str, float]:
+def measures(image: np.ndarray, target: np.ndarray, weight: np.ndarray, light: bool = True) -> dict[str, float]:
     """How alike two pictures are, for people: root mean square error, structural similarity, and the mean colour
     difference ΔE of CIE 2000, where there is colour.
 
-    image, target : (H, W, C), linear radiance, of which 1 is white. weight : (H, W).
+    image, target : (H, W, C), linear radiance, of which 1 is white; unless `light`, other numbers, of which the first
+        is all that is told. weight : (H, W).
     """
+    if not light:
+        return {"root mean square error": root_mean_square(image - target, weight)}
     from skimage.metrics import structural_similarity
 
     from rimlight import pictures

@@ -99,6 +99,9 @@ class Loss:
     """Levels of a Gaussian pyramid; the loss is the mean of theirs. 0: only the pictures themselves."""
     exclude_above: float | None = None
     """Pixels whose target exceeds this radiance in any channel do not count."""
+    channel: str | None = None
+    """What of the pictures of `aov_edge` is compared: the name of one of its channels, such as a depth map or a mask,
+    whose numbers the target holds as they are. Default: for integrators that render nothing but light."""
 
 
 @dataclass(frozen=True, kw_only=True)

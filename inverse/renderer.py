@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -135,6 +135,9 @@ class View:
         self.film = mi.traverse(self.sensor)
         #: The last channel of the film, which is not compared.
         self.alpha = mi.has_flag(self.sensor.film().flags(), mi.FilmFlags.Alpha)
+        #: Is it radiance that is compared, or another channel?
+        self.shows_light = self._check_channel()
+        self._channels = 0  # of the picture that was last rendered
         film = self.sensor.film()
         self.size = tuple(int(n) for n in reversed(film.crop_size()))
         if tuple(film.crop_size()) != tuple(film.size()) and any(s.resolution for s in renderer.problem.stage):
@@ -146,6 +149,27 @@ class View:
         self.functions: dict[Any, tuple[Callable, Callable]] = {}
         self.kinds = {}
         self._picture: tuple[np.ndarray, np.ndarray] | None = None
+
+    def _check_channel(self) -> bool:
+        """Does the channel that is compared hold radiance?
+
+        Raises
+        ------
+        ValueError : the integrator has no such channel, or several of which none is named.
+        """
+        channel, integrator = self.renderer.problem.loss.channel, self.integrator
+        if not hasattr(integrator, "layout"):
+            if channel is None:
+                return True
+            raise ValueError(
+                f'fit: loss.channel is "{channel}", but the integrator renders light alone; use aov_edge, such as '
+                f'integrator = {{ type = "aov_edge", aovs = "{channel}:depth" }}'
+            )
+        known = [*integrator.nested, *(c.name for c in integrator.channels)]
+        if channel not in known:
+            got = "is missing" if channel is None else f'cannot be "{channel}"'
+            raise ValueError(f"fit: loss.channel {got}: the integrator has {', '.join(known)}")
+        return channel in integrator.nested
 
     # ---------------------- Target ----------------------
 
@@ -162,7 +186,9 @@ class View:
                     )
                 weight = np.ones(image.shape[:2], np.float32)
             else:
-                image, weight = targets.read(self.target, self.size)
+                plain = not self.shows_light and self.target.colour == "auto"
+                target = replace(self.target, colour="linear") if plain else self.target
+                image, weight = targets.read(target, self.size)
             self._picture = image, losses.pixels_that_count(loss, image, weight)
         return self._picture
 
@@ -248,13 +274,23 @@ class View:
             return self._colours(np.array(image(self.scene, self.integrator, dr.opaque(mi.UInt32, seed))))
 
     def _colours(self, image: np.ndarray) -> np.ndarray:
-        return (image[..., :-1] if self.alpha else image).astype(np.float32)
+        """What is compared, of a picture: (H, W, 1 | 3). Texture coordinates have a third channel of zeros."""
+        self._channels = image.shape[2]
+        part = image[..., self._part()].astype(np.float32)
+        return np.pad(part, ((0, 0), (0, 0), (0, 1))) if part.shape[2] == 2 else part
+
+    def _part(self) -> slice:
+        """Where it is among the channels of a picture."""
+        channel = self.renderer.problem.loss.channel
+        part = slice(0, self._channels) if channel is None else self.integrator.layout(self._channels)[channel]
+        return slice(part.start, part.stop - 1) if self.alpha and self.shows_light else part
 
     def backward(self, by_pixel: np.ndarray, seed: int, spp: int) -> None:
         _, derivative = self._functions(spp)
-        if self.alpha:
-            by_pixel = np.concatenate([by_pixel, np.zeros_like(by_pixel[..., :1])], axis=2)
-        weight = mi.TensorXf(by_pixel.astype(np.float32)) * dr.opaque(mi.Float, 1)
+        part = self._part()
+        whole = np.zeros((*by_pixel.shape[:2], self._channels), np.float32)
+        whole[..., part] = by_pixel[..., : part.stop - part.start]
+        weight = mi.TensorXf(whole) * dr.opaque(mi.Float, 1)
         dr.eval(weight)
         with no_collection():
             derivative(self.scene, self.integrator, weight, dr.opaque(mi.UInt32, seed))

@@ -42,7 +42,7 @@ def sunk_in_gloss() -> mi.Scene:
 
 def sunk_ball() -> mi.Scene:
     """A smooth-shaded ball, less than half of it in the floor, which it overhangs: under a sky, and a lamp."""
-    vertices, normals, _, faces = ball(12)
+    vertices, _, _, faces = ball(12)
     thing = mesh("ball", 0.5 * vertices + [0.1, 0.2, 0], faces, normals=True, bsdf=diffuse(0.8, 0.5, 0.3))
     floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
     bulb = {"type": "point", "position": [0.6, 3, -1.5], "intensity": 10.0}

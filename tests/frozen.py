@@ -66,3 +66,10 @@ def assert_same(frozen, unfrozen):
     scale = np.abs(unfrozen).max(axis=0)
     assert (scale > 0).all() and (np.abs(np.diff(unfrozen, axis=0)).max(axis=0) > 1e-3 * scale).all()
     np.testing.assert_allclose(frozen / scale, unfrozen / scale, rtol=0, atol=1e-5)
+
+
+def first_cause(error: BaseException) -> str:
+    """The text of the exception that started it."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error)

@@ -31,6 +31,7 @@ TESTS = (
     "direct_edge",
     "prb_edge",
     "random_scenes",
+    "aov_edge",
 )
 FOLDER = "tests/plugins/integrators"
 
@@ -170,8 +171,8 @@ MUTANTS = [
     mutant(
         "film boundary: cuts of the near plane stand still",
         OUTLINES,
-        "t = depth[0] / dr.select(crossed, depth[0] - depth[k], 1)",
-        "t = dr.detach(depth[0] / dr.select(crossed, depth[0] - depth[k], 1))",
+        "a, b, crossed = cut_by_plane(corners, depth)",
+        "a, b, crossed = dr.detach(cut_by_plane(corners, depth))",
     ),
     mutant("film boundary: looks 100 times as far aside", FILM, "in_world = 8 * ulp", "in_world = 800 * ulp"),
     mutant(
@@ -247,6 +248,25 @@ MUTANTS = [
         SHADING,
         "return value + faces * edge if tracer.scatters(2) else value",
         "return value",
+    ),
+    # ---------------------- Channels besides light ----------------------
+    mutant(
+        "channels: what a ray meets follows the surface",
+        "plugins/transport/channels.py",
+        "si = seen_by_camera(ray, pi, active, attached=attached)",
+        "si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)",
+    ),
+    mutant(
+        "channels: edges of smooth meshes left out",
+        "plugins/integrators/_channel_search.py",
+        '"soft": "geo_normal" in self.kinds',
+        '"soft": False',
+    ),
+    mutant(
+        "channels: seams of texture coordinates left out",
+        "plugins/integrators/_channel_search.py",
+        '"seams": "uv" in self.kinds',
+        '"seams": False',
     ),
 ]
 

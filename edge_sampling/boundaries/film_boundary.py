@@ -85,13 +85,23 @@ class FilmBoundary:
     lights : of the scene.
     soft : are there lights with a size, or light that is scattered? Then a part of it may lie behind one face of a
         smooth-shaded mesh, but not behind the next, and what is seen jumps at the edge (see `face_planes.py`).
+    seams : do the seams of the texture coordinates of spheres, disks and cylinders count?
     """
 
     DRJIT_STRUCT = dict.fromkeys(("outlines", "lights", "farther"))  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, lights: Lights, *, soft: bool):
+    def __init__(
+        self,
+        geometry: Geometry,
+        edges: Edges,
+        moving: np.ndarray,
+        lights: Lights,
+        *,
+        soft: bool,
+        seams: bool = False,
+    ):
         self.lights = lights
-        self.outlines = FilmOutlines(geometry, edges, moving, soft=soft)
+        self.outlines = FilmOutlines(geometry, edges, moving, soft=soft, seams=seams)
         self.farther = self._farther(geometry)
 
     @property

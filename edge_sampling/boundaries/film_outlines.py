@@ -79,13 +79,13 @@ class FilmOutlines:
 
     Parameters
     ----------
-    geometry, edges, moving, soft : see `FilmBoundary`.
+    geometry, edges, moving, soft, seams : see `FilmBoundary`.
     """
 
     _PARTS = ("edges", "corners", "spreads", "horizons", "curves", "lines")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool):
+    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool, seams: bool):
         self.geometry, self.soft = geometry, soft
         self.lines = geometry.lines
         edges, faces = edges.of_meshes(moving), geometry.faces(moving)
@@ -97,7 +97,7 @@ class FilmOutlines:
         self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
         shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
         shapes = tuple(s for s, moves in shapes if moves)
-        self.curves = Curves(shapes) if shapes else None
+        self.curves = Curves(shapes, seams=seams) if shapes else None
         horizons = Horizons(geometry, moving[: len(geometry.meshes)])
         self.horizons = horizons if len(horizons) else None
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 class CurveKind(IntEnum):
     """CONTOUR : of a sphere. RIM : of a disk. BOTTOM, TOP : rims of a cylinder, at z = 0 and 1 of its own frame. LEFT,
-    RIGHT : its contour lines."""
+    RIGHT : its contour lines. SEAM_… : where texture coordinates jump from 1 to 0, which is no outline."""
 
     CONTOUR = 0
     RIM = 1
@@ -24,6 +24,9 @@ class CurveKind(IntEnum):
     TOP = 3
     LEFT = 4
     RIGHT = 5
+    SEAM_OF_SPHERE = 6
+    SEAM_OF_DISK = 7
+    SEAM_OF_CYLINDER = 8
 
 
 #: Curves of the shapes with known outlines, by Mitsuba's names of their classes.
@@ -31,6 +34,13 @@ CURVES = {
     "Sphere": (CurveKind.CONTOUR,),
     "Disk": (CurveKind.RIM,),
     "Cylinder": (CurveKind.BOTTOM, CurveKind.TOP, CurveKind.LEFT, CurveKind.RIGHT),
+}
+
+#: Lines on these shapes at which their texture coordinates jump: in the half-plane y = 0, x > 0 of their own frame.
+SEAMS = {
+    "Sphere": CurveKind.SEAM_OF_SPHERE,
+    "Disk": CurveKind.SEAM_OF_DISK,
+    "Cylinder": CurveKind.SEAM_OF_CYLINDER,
 }
 
 #: Every curve is cut into so many pieces of equal parameter.
@@ -59,13 +69,15 @@ class Curves:
     Parameters
     ----------
     shapes : of the classes in `CURVES`.
+    seams : are the seams of their texture coordinates among them?
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("count", "_shapes", "_kind", "_shape"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("count", "_shapes", "_seams", "_kind", "_shape"))  # for `dr.freeze`
 
-    def __init__(self, shapes: tuple[mi.Shape, ...]):
-        self._shapes = shapes
+    def __init__(self, shapes: tuple[mi.Shape, ...], *, seams: bool = False):
+        self._shapes, self._seams = shapes, seams
         curves = [(kind, i) for i, s in enumerate(shapes) for kind in CURVES[s.class_name()]]
+        curves += [(SEAMS[s.class_name()], i) for i, s in enumerate(shapes)] if seams else []
         #: Number of curves.
         self.count = len(curves)
         # Not in NumPy's memory, for frozen functions.
@@ -120,7 +132,7 @@ class Curves:
             inwards = dr.select(contour, -local, inwards)
             valid &= ~contour | far | (d2 > 1)
 
-            side = kind >= int(CurveKind.LEFT)
+            side = (kind == int(CurveKind.LEFT)) | (kind == int(CurveKind.RIGHT))
             r2 = dr.square(e.x) + dr.square(e.y)
             turn = dr.select(far, 0.5 * dr.pi, dr.safe_acos(dr.rsqrt(r2)))
             sin, cos = dr.sincos(dr.atan2(e.y, e.x) + dr.select(kind == int(CurveKind.LEFT), turn, -turn))
@@ -128,6 +140,9 @@ class Curves:
             tangent = dr.select(side, mi.Vector3f(0, 0, 1), tangent)
             inwards = dr.select(side, mi.Vector3f(-cos, -sin, 0), inwards)
             valid &= ~side | ((r2 > 0) & far) | (r2 > 1)
+            if self._seams:
+                seam, on_seam, along = _seam(kind, v)
+                local, tangent = dr.select(seam, on_seam, local), dr.select(seam, along, tangent)
         x, y, z, o = self._columns(frames, curve, 0)
         p = mi.Point3f(x * local.x + y * local.y + z * local.z + o)
         with dr.suspend_grad():
@@ -149,3 +164,13 @@ class Curves:
         """Images of the axes, and of the origin."""
         first = dr.gather(mi.UInt32, self._shape, curve) * 24 + start
         return [mi.Vector3f(*(dr.gather(mi.Float, frames, first + 4 * i + j) for i in range(3))) for j in range(4)]
+
+
+def _seam(kind: mi.UInt32, v: mi.Float) -> tuple[mi.Bool, mi.Vector3f, mi.Vector3f]:
+    """Is it a seam? Its point at v in [0, 1), and the tangent there, both in the frame of the shape."""
+    sphere, disk, cylinder = (kind == int(SEAMS[name]) for name in ("Sphere", "Disk", "Cylinder"))
+    sin, cos = dr.sincos(dr.pi * v)
+    point = dr.select(sphere, mi.Vector3f(sin, 0, cos), dr.select(disk, mi.Vector3f(v, 0, 0), mi.Vector3f(1, 0, v)))
+    along = dr.select(disk, mi.Vector3f(1, 0, 0), mi.Vector3f(0, 0, 1))
+    along = dr.select(sphere, dr.pi * mi.Vector3f(cos, 0, -sin), along)
+    return sphere | disk | cylinder, point, along

@@ -119,7 +119,8 @@ def finite_differences(
 def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
     """Render with the `multijitter` sampler, whichever the sensor has: (H, W, C), linear radiance, double precision.
 
-    integrator : a sampling integrator of Mitsuba (`path`, `direct`, ...).
+    integrator : a sampling integrator of Mitsuba (`path`, `direct`, `aov`, ...). Of one with channels besides light
+        (`aov_names`), these alone are returned, without an image of light.
     """
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
@@ -131,17 +132,17 @@ def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sen
     border = 2 * film.rfilter().border_size() if film.sample_border() else 0
     sampler.set_samples_per_wavefront(spp // passes)
     sampler.seed(seed, int(np.prod(np.array(film.crop_size()) + border)) * (spp // passes))
-    images = []
+    images, names = [], integrator.aov_names()
     with dr.suspend_grad():
         for _ in range(passes):
-            film.prepare([])
+            film.prepare(names)
             ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, _Pass(sampler, spp // passes))
-            L, valid, _ = integrator.sample(scene, sampler, ray)
+            L, valid, channels = integrator.sample(scene, sampler, ray)
             block = film.create_block()
             alpha = dr.select(valid, mi.Float(1), 0)
-            ADIntegrator._splat_to_block(block, film, position, L * weight, 1.0, alpha, [], ray.wavelengths)
+            ADIntegrator._splat_to_block(block, film, position, L * weight, 1.0, alpha, channels, ray.wavelengths)
             film.put_block(block)
-            images.append(np.array(film.develop(), np.float64))
+            images.append(np.array(film.develop(), np.float64)[:, :, -len(names) :])
             sampler.schedule_state()
             sampler.advance()
     return np.mean(images, axis=0)

@@ -12,7 +12,7 @@ from rimlight.edge_sampling import Batch
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.terms.order import TERMS
 from rimlight.terms.sampling import Counts
-from rimlight.terms.term import FilmSamples, Job, Sample
+from rimlight.terms.term import FilmSamples, Job, Sample, Term
 from rimlight.transport.paths import Depths
 from rimlight.transport.tracer import PathTracer
 
@@ -40,6 +40,9 @@ class EdgeIntegrator(ADIntegrator):
 
     #: What traces paths: a subclass of `PathTracer`.
     TRACER: type[PathTracer] = PathTracer
+
+    #: The terms of the derivative, in their order; the interior is the first.
+    TERMS: tuple[Term, ...] = TERMS
 
     #: Does the derivative have what the planes of faces do to soft light, where other normals shade?
     PLANES = True
@@ -98,7 +101,7 @@ class EdgeIntegrator(ADIntegrator):
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Forward)
             job.boundaries.refit()
             terms, values = [], []
-            for make in (make for term in TERMS for make in term.samples(job)):
+            for make in (make for term in self.TERMS for make in term.samples(job)):
                 # One term after the other: path replay needs that nothing else is attached to the parameters.
                 term = make()
                 with dr.resume_grad():
@@ -124,11 +127,11 @@ class EdgeIntegrator(ADIntegrator):
         with dr.isolate_grad(), dr.suspend_grad():
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Backward)
             job.boundaries.refit()
-            terms = [make() for term in TERMS for make in term.samples(job)]
+            terms = [make() for term in self.TERMS for make in term.samples(job)]
             with dr.resume_grad():
                 # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
                 # is traced for it.
-                values = [dr.zeros(type(t.value), dr.width(t.position)) for t in terms]
+                values = [t.value.zeros(dr.width(t.position)) for t in terms]
                 dr.enable_grad(values)
                 image = self._develop(job.sensor.film(), terms, values)
                 dr.set_grad(image, grad_in)
@@ -169,9 +172,26 @@ class EdgeIntegrator(ADIntegrator):
         return film.develop()
 
     def sample(self, mode, scene, sampler, ray, active=True, **_):
-        """Radiance along camera rays, as Mitsuba asks for it."""
+        """Radiance along camera rays, as Mitsuba asks for it.
+
+        Raises
+        ------
+        RuntimeError : it is asked for by an integrator that differentiates what comes back, such as Mitsuba's `aov`.
+        """
+        self._refuse_to_be_differentiated(scene)
         found = self.TRACER(scene, self).radiance(ray, sampler, mi.Bool(active), attached=mode != dr.ADMode.Primal)
         return found.L, found.valid, [], found.rest
+
+    def _refuse_to_be_differentiated(self, scene: mi.Scene) -> None:
+        probe = mi.Float(0)
+        dr.enable_grad(probe)
+        # Our own calls suspend gradients.
+        if dr.grad_enabled(probe) and any(dr.grad_enabled(v) for v in values_of(mi.traverse(scene)).values()):
+            raise RuntimeError(
+                f"{self.name}: an integrator around it, such as Mitsuba's aov, differentiates its samples, and would "
+                "lack the motion of visibility. Use aov_edge around it, which has the same syntax; or render the image "
+                "alone, within dr.suspend_grad()."
+            )
 
     def sample_rays(self, scene, sensor, sampler):
         """Camera rays, their weights, and film positions in pixels, as Mitsuba has it."""
@@ -204,7 +224,7 @@ class EdgeIntegrator(ADIntegrator):
             lights_move=found.lights_move,
             edges=len(search.edges),
             tree=found.silhouettes.leaves if found.silhouettes is not None else 0,
-            terms=tuple(term.planned(job) for term in TERMS),
+            terms=tuple(term.planned(job) for term in self.TERMS),
             limits=found.limits,
         )
 

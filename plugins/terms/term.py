@@ -31,6 +31,9 @@ class Sample:
     L: mi.Spectrum
     alpha: mi.Float
 
+    def zeros(self, width: int) -> Sample:
+        return dr.zeros(Sample, width)
+
 
 @dataclass(frozen=True)
 class FilmSamples:

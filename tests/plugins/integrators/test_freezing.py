@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from frozen import Step, assert_same, loss_of, losses_and_gradients, moved, numbers
+from frozen import Step, assert_same, first_cause, loss_of, losses_and_gradients, moved, numbers
 
 VALUES = [
     ("two_triangles", "green.vertex_positions"),
@@ -198,9 +198,3 @@ def test_says_that_paths_need_a_limit():
     with pytest.raises(RuntimeError) as error:
         Step().frozen()(scene, integrator, dr.opaque(mi.UInt32, 0))
     assert 'set "max_depth" to at most' in first_cause(error.value)
-
-
-def first_cause(error: BaseException) -> str:
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return str(error)
