@@ -115,14 +115,18 @@ class Alternations:
             errors = self.judge.errors(state.guess, self.kind, view.points, view.seen, view.indirect)
             state.left_out, state.uncertain = float(errors.mean()), float(errors.std() / np.sqrt(len(errors)))
 
-    def run(self, start: State, most: int, record: Callable[[State, float], None]) -> State:
-        """The best of the states that at most so many alternations make, and of the first. record : is called with
-        each new one and its residual; what predicts worse than the best one ends up as nothing but a record."""
+    def run(self, start: State, most: int, record: Callable[[State, float], None], seen: View | None = None) -> State:
+        """The best of the states that at most so many alternations make, and of the first.
+
+        record : is called with each new one and its residual. seen : the view of the first, if it is known.
+        """
         state, best, view, worse = start, None, None, 0
         state.guess = self.kind.of(state.guess, self.lobes)
         for i in range(most + 1):
-            view = self.view(state.guess, state.depth, None if view is None else view.indirect, i)
-            if not state.start:
+            if seen is None:
+                seen = self.view(state.guess, state.depth, None if view is None else view.indirect, i)
+            view, seen = seen, None
+            if not (state.start and i == 0 and np.isfinite(state.left_out)):
                 self.score(state, view)
             worse = 0 if state.better_than(best) else worse + 1
             if not worse:
@@ -157,17 +161,18 @@ class Alternations:
             guess.exposures[np.abs(np.log(guess.exposures)) < STATED] = 1
         return float(np.sqrt(residual) / model.scale)
 
-    def judged_start(self, guess: Guess, lights: np.ndarray, kinds: tuple[Kind, ...]) -> State:
-        """The start, with its normals held, as its best material of these kinds predicts what was left out."""
+    def judged_start(self, guess: Guess, lights: np.ndarray, kinds: tuple[Kind, ...]) -> tuple[State, View | None]:
+        """The start, with its normals held, as its best material of these kinds predicts what was left out; and its
+        view, if anything was."""
         depth = self.integrate(guess)
-        state = State(guess, depth, Kind(), start=True)
+        state, view = State(guess, depth, Kind(), start=True), None
         if self.judge.able:
             view = self.view(self.kind.of(guess, self.lobes), depth)
             of_view = view.points, view.seen, view.indirect
             state.left_out = min(
                 float(self.judge.errors(guess, kind, *of_view, lights=lights).mean()) for kind in kinds
             )
-        return state
+        return state, view
 
 
 def _smooth(pixels: np.ndarray, mask: np.ndarray, width: float) -> None:

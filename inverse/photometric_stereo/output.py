@@ -192,8 +192,9 @@ def bsdf_figure(result: Result) -> Figure:
             axes.plot(outgoing, values, color=page.COLOURS[i], linewidth=1.3, label=f"θᵢ = {incidence}°")
         axes.set(xlabel="θₒ, degrees", ylabel="" if c else "f cos θₒ, 1/sr")
         axes.set_title(colour, fontsize=9, color=page.INK)
-        axes.set_yscale("log")
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], axes.get_ylim()[1] * 1e-4))
+        if weights.any():  # else there is no glaze over the diffuse colours
+            axes.set_yscale("log")
+            axes.set_ylim(bottom=max(axes.get_ylim()[0], axes.get_ylim()[1] * 1e-4))
         page.paint(axes)
         if c == 0:
             axes.legend(fontsize=7.5, labelcolor=page.INK, framealpha=0, edgecolor="none")

@@ -34,8 +34,8 @@ log = logging.getLogger(__name__)
 #: Pixels without which there is no surface.
 FEWEST = 9
 
-#: Alternations of each other kind of material, after those of the first: with the normals of the start, anything may
-#: look like a coat.
+#: Alternations of each kind of material, from the best state of the simplest: with the normals of the start, anything
+#: may look like a coat.
 SETTLED = 3
 
 
@@ -180,7 +180,7 @@ def reconstruct(
     scale = _scale(data.at(options.resolutions[0]), options)
     result, coarse = None, 1
     kinds = options.kinds()
-    others = SETTLED * (len(kinds) - 1)
+    others = SETTLED * len(kinds) if len(kinds) > 1 else 0
     bar = tqdm(total=sum(options.iterations) + others + options.descent.steps, desc="ps", disable=not progress)
 
     def record(state: State, residual: float) -> None:
@@ -203,24 +203,26 @@ def reconstruct(
         kind = kinds[0] if result is None else result.kind
         work = Alternations(level, lobes, kind, judge, options, rng)
         guess = _start(level, lobes, counts, options)
-        start = work.judged_start(guess, _flat(level).lighting()[0], kinds)
+        start, seen = work.judged_start(guess, _flat(level).lighting()[0], kinds)
         if result is None:
             result = Result(level, lobes, guess, start.depth, work.domain, guess.normals, scale, kind)
             first = copy.deepcopy(start)
+            if kind.several:  # which is another guess
+                seen = None
         else:
             _refine(result, level, before=coarse, now=round(1 / size))
             first = State(result.guess, work.domain.integrate(result.guess.normals, options.bilateral), kind)
+            seen = None
         result.data, result.domain, coarse = level, work.domain, round(1 / size)
-        best = work.run(first, most, record)
+        best = work.run(first, most, record, seen)
         if size == options.resolutions[0]:
-            for kind in kinds[1:]:
-                if not judge.able:
-                    break
+            settled = best
+            for kind in kinds if judge.able and len(kinds) > 1 else ():
                 del work
                 work = Alternations(level, lobes, kind, judge, options, rng)
-                again = dataclasses.replace(copy.deepcopy(best), left_out=np.nan, start=False)
+                again = dataclasses.replace(copy.deepcopy(settled), left_out=np.nan)
                 found = work.run(again, SETTLED, record)
-                if found.needed_beside(best):
+                if found.better_than(best) if kind == best.kind else found.needed_beside(best):
                     best = found
         if start.left_out < best.left_out:
             best = start

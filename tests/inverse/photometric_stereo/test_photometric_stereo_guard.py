@@ -14,10 +14,11 @@ import pytest
 from PIL import Image
 
 from rimlight.cli import main
-from rimlight.exr import replacing
+from rimlight.exr import read_exr, replacing
 from rimlight.inverse import photometric_stereo as ps
-from rimlight.inverse.photometric_stereo import alternation, dataset, least_squares, simulation
+from rimlight.inverse.photometric_stereo import alternation, dataset, least_squares, output, report, simulation
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.evidence import Kind
 from rimlight.inverse.photometric_stereo.rendering import Rendering
 
 N = 24
@@ -77,14 +78,29 @@ def test_the_best_state_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
 
     states = []
     monkeypatch.setattr(alternation.Alternations, "score", score)
-    monkeypatch.setattr(alternation.Alternations, "judged_start", lambda self, guess, *_: alternation.State(
-        guess, self.integrate(guess), self.kind, 4.0, start=True))  # fmt: skip
+    monkeypatch.setattr(alternation.Alternations, "judged_start", lambda self, guess, *_: (alternation.State(
+        guess, self.integrate(guess), self.kind, 4.0, start=True), None))  # fmt: skip
     options = ps.Options(**{**QUICK, "iterations": (4,), "tolerance": 0.0}, reflectance=False)
     found = ps.reconstruct(matte, options, progress=False, after=lambda r: states.append(r.guess.normals.copy()))
     assert len(states) == 4
     np.testing.assert_array_equal(found.guess.normals, states[1])
     assert found.verdict == "judged"
     assert found.left_out == {"start": 4.0, "result": 1.0}
+
+
+def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
+    """Of several materials, in the unit of the images."""
+    options = ps.Options(**QUICK, reflectance=False)
+    found = ps.reconstruct(matte, options, progress=False)
+    found.guess = Kind(several=True).of(found.guess, found.lobes)
+    output.write_numbers(tmp_path, found, options, status="finished")
+    base = read_exr(tmp_path / "base.exr")[0][""]
+    np.testing.assert_allclose(base[matte.mask], found.guess.base, rtol=1e-6)
+    assert base[matte.mask].mean() == pytest.approx(0.5, rel=0.05)
+    assert json.loads((tmp_path / "metadata.json").read_text("utf-8"))["materials"] == "several"
+    report.write(tmp_path, found, options, title="colours", status="finished")
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert "Diffuse colours" in text and "values that were left out are predicted" in text
 
 
 def test_maps_of_a_result(matte: Dataset) -> None:
@@ -194,7 +210,7 @@ def test_ctrl_c_waits_for_the_end_of_an_alternation(matte: Dataset, tmp_path, mo
 
     def pressed(self, model):
         calls.append(model)
-        if len(calls) == 2:
+        if len(calls) == 1:
             os.kill(os.getpid(), signal.SIGINT)
         return visible(self, model)
 
@@ -202,7 +218,7 @@ def test_ctrl_c_waits_for_the_end_of_an_alternation(matte: Dataset, tmp_path, mo
     out = tmp_path / "out"
     options = ["--resolutions", "1", "--iterations", "5", "--max-depth", "2", "--no-reflectance"]
     assert main(["ps", "run", str(tmp_path / "data"), "--out", str(out), *options]) == 130
-    assert len(calls) == 2
+    assert len(calls) == 1
     metadata = json.loads((out / "metadata.json").read_text("utf-8"))
     assert metadata["status"] == "interrupted"
     assert len(metadata["history"]) == 1
