@@ -26,7 +26,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
     Raises
     ------
-    OSError : the folder does not exist or cannot be written to, or `path` is a folder. The text names `path`.
+    OSError : the folder does not exist or cannot be written to, the disk is full, or `path` is a folder. The text names
+        `path`.
     """
     path = Path(path)
     if path.is_dir():
@@ -39,6 +40,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"cannot write {path}: {error.strerror or error}") from None
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -129,6 +129,13 @@ def fresnel(eta: float, c: Any) -> Any:
     return 0.5 * dr.square(k * dr.rcp(dr.square(s) * q)) * dr.fma(p, p, dr.square(q))
 
 
+def diffuse(eta: float, cos_i: Any, cos_o: Any) -> Any:
+    """The value of a diffuse lobe, per sr, without the cosine: Lambertian (`eta` is NaN), or under a smooth coat."""
+    if np.isnan(eta):
+        return dr.inv_pi + 0 * cos_o
+    return coated(eta, dr.maximum(cos_i, GRAZING), dr.maximum(cos_o, GRAZING)) * dr.inv_pi
+
+
 def coated(eta: float, cos_i: Any, cos_o: Any) -> Any:
     """π times a diffuse lobe under a smooth coat, which lets 1 - F in and out: of the light, 1 - F(cos θᵢ) is reflected
     in all (Shirley et al. 1997, with Fresnel's term instead of Schlick's)."""

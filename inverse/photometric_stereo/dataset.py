@@ -5,8 +5,10 @@ Axes, in all of this package: x to the right, y up, z towards the camera. Rows o
 
 from __future__ import annotations
 
+import functools
+import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,10 +18,20 @@ from tqdm import tqdm
 from rimlight.inverse.targets import read_picture, srgb_to_linear
 from rimlight.leds import Led, read_leds, write_leds
 
+from . import least_squares
 from .integration import check_camera, ray_matrix
+from .vectors import unit
 
 #: Of linear sRGB; those with which published results on DiLiGenT weigh the channels.
 LUMINANCE = np.array([0.2989, 0.5870, 0.1140], np.float32)
+
+log = logging.getLogger(__name__)
+
+#: Part of the values that may be as large as the largest one, by chance.
+CLIPPED = 1e-3
+
+#: Pixels from which `looks_encoded` judges.
+JUDGED = 2000
 
 DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
     "light_directions.txt",
@@ -90,6 +102,14 @@ class Dataset:
     def near(self) -> bool:
         """Are the lights at finite distances?"""
         return not isinstance(self.lights, np.ndarray)
+
+    @functools.cached_property
+    def clipped(self) -> np.ndarray:
+        """Which values are as large as the image could hold: (P, K), bool. They are where more than `CLIPPED` of all
+        values are the largest one, but for rounding."""
+        pictured = self.values * self.intensities.astype(np.float32)
+        found = (pictured >= (1 - 1e-4) * pictured.max()).any(2)
+        return found if CLIPPED < found.mean() < 1 - CLIPPED else np.zeros_like(found)
 
     @property
     def luminance(self) -> np.ndarray:
@@ -174,12 +194,6 @@ class Dataset:
         return found
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of length 1; those of length 0 face the camera."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > 0, vectors / np.where(length > 0, length, 1), [0, 0, 1])
-
-
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Between vectors (..., 3), degrees. Accurate for small ones, too."""
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
@@ -230,11 +244,33 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     values = np.empty((mask.sum(), len(names), 3), np.float32)
     for k, name in enumerate(tqdm(names, desc="images", disable=True if len(names) < 10 else None, leave=False)):
         values[:, k] = read_pixels(folder / name, mask) / intensities[k]
+    if not near and looks_encoded(values * intensities.astype(np.float32), names, lights, intensities):
+        log.warning(
+            "ps: the pictures have 8 bits, and look as if they were encoded as sRGB, but PNG is taken to be linear; "
+            "export them with 16 bits, linear, or as JPEG, which is decoded"
+        )
     camera = read_camera(folder)
     distance = _numbers(folder / DISTANCE, 1)[0, 0] if (folder / DISTANCE).is_file() else None
     data = Dataset(values, mask, lights, intensities, camera, _truth(folder, mask), tuple(names), distance)
     away = folder / LIGHT_DISTANCE
     return data.with_near_lights(_numbers(away, 1)[0, 0]) if away.is_file() else data
+
+
+def looks_encoded(pictures: np.ndarray, names: Sequence[str], lights: np.ndarray, intensities: np.ndarray) -> bool:
+    """Do PNG of 8 bits fit a diffuse surface better if they are decoded from sRGB? pictures : (P, K, 3), as read."""
+    few = pictures[:: -(-len(pictures) // JUDGED) or 1]
+    if not len(few) or not all(name.lower().endswith(".png") for name in names) or few.max() > 1 + 1e-5:
+        return False
+    levels = few * 255
+    if np.abs(levels - np.round(levels)).max() > 1e-2:
+        return False
+
+    def residual(values: np.ndarray) -> float:
+        v = (values / intensities.astype(np.float32)) @ LUMINANCE
+        off = np.abs(least_squares.predicted(least_squares.trimmed(v, lights), lights) - v)
+        return float(np.median(off, axis=1).sum() / np.median(v, axis=1).sum())
+
+    return residual(srgb_to_linear(few)) < residual(few)
 
 
 def write(folder: Path, data: Dataset) -> None:

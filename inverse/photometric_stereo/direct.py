@@ -1,17 +1,19 @@
-"""What surfaces reflect of the lights without detours, and its fit: normals and albedos pixel by pixel, one BSDF.
+"""What surfaces reflect of the lights without detours, and its fit: what is a pixel's own, and what pixels share.
 
 The model of the value of pixel p under light k, a colour:
 
-    V_pk s_k a_p E_pk f(n_p; l_pk, v_p) max(n_p · l_pk, 0) + I_pk
+    V_pk s_k E_pk (a_p f(n_p; l_pk, v_p) + b_p g(n_p; l_pk, v_p)) max(n_p · l_pk, 0) + I_pk
 
-with exposure s, albedo a (of pixels, relative to the BSDF), irradiance E over the intensity of the light, visibility V,
-and indirect light I. Given the BSDF f, each pixel has three unknowns, found by damped Gauss-Newton steps; given these,
-the weights of a dictionary are a non-negative least squares problem. Residuals count by Huber's loss.
+with exposure s, irradiance E over the intensity of the light, visibility V, and indirect light I. Of one material, a is
+the albedo of pixels, relative to the BSDF f, and b is 0. Of several under one glaze, a is 1, f has glossy lobes only,
+and b is the colour of a diffuse lobe g, a pixel's own (Lambertian, or under a smooth coat). Given f, each pixel has
+three unknowns, or five, found by damped Gauss-Newton steps; given these, the weights of a dictionary are a non-negative
+least squares problem. Residuals count by Huber's loss.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -31,9 +33,8 @@ LONGEST, DAMPING, ALBEDOS = 0.2, 1.02, (0.02, 20.0)
 #: Residuals count fully up to this part of the median value of the data set.
 HUBER = 0.05
 
-#: Of what the squares would be without it, a diffuse lobe under a coat must leave at most this. It is much like a
-#: Lambertian one on normals that lean a little: otherwise it would be taken for all sorts of small errors.
-EVIDENCE = 0.78
+#: Largest diffuse colour of a pixel. Above 1, for the scale of the images may be a guess.
+LIGHTEST = 4.0
 
 #: Pixels from which the BSDF is found; and by how much the diagonal of its equations is raised.
 SAMPLED, RIDGE = 2000, 1e-6
@@ -41,12 +42,21 @@ SAMPLED, RIDGE = 2000, 1e-6
 
 @dataclass
 class Guess:
-    """What is sought, but depth. normals : (P, 3). albedo : (P,). exposures : (K,). weights : (B, 3), of the BSDF."""
+    """What is sought, but depth. normals : (P, 3). albedo : (P,). exposures : (K,). weights : (B, 3), of the BSDF.
+    base : (P, 3), the diffuse colours of several materials under one glaze, or None, of one material. base_eta : the
+    index of refraction of the coat over them; NaN: they are Lambertian."""
 
     normals: np.ndarray
     albedo: np.ndarray
     exposures: np.ndarray
     weights: np.ndarray
+    base: np.ndarray | None = None
+    base_eta: float = np.nan
+
+    def of(self, pixels: np.ndarray) -> Guess:
+        """What is said of some pixels: their numbers, or a mask."""
+        base = None if self.base is None else self.base[pixels]
+        return replace(self, normals=self.normals[pixels], albedo=self.albedo[pixels], base=base)
 
 
 class DirectModel:
@@ -137,6 +147,9 @@ class DirectModel:
         scale = dr.gather(mi.Float, own(guess.albedo), p) * dr.gather(mi.Float, own(guess.exposures), k)
         found = self._reflected(bsdf_of(self.lobes, guess.weights), n, self.view(point), direction)
         found *= scale * irradiance
+        if guess.base is not None:
+            colour = dr.gather(mi.Color3f, own(guess.base), p) * dr.gather(mi.Float, own(guess.exposures), k)
+            found += colour * irradiance * diffuse(guess.base_eta, n, self.view(point), direction)
         if self.indirect is not None:
             found += dr.gather(mi.Color3f, self.indirect, p * self.K + k)
         return np.array(found).T.reshape(len(pixels), self.K, 3)
@@ -147,71 +160,77 @@ class DirectModel:
         row = number // self.K
         return dr.gather(mi.UInt32, mi.UInt32(pixels.astype(np.uint32)), row), number - row * self.K
 
-    # ---------------------- Normals and albedos ----------------------
+    # ---------------------- Of each pixel ----------------------
 
-    def fit_normals(self, guess: Guess, *, steps: int = 3, free_albedo: bool = True) -> None:
-        """Gauss-Newton steps of every pixel, in place."""
+    def fit_normals(self, guess: Guess, *, steps: int = 3, free_albedo: bool = True, turn: bool = True) -> None:
+        """Gauss-Newton steps of every pixel, in place: of its normal, and its albedo or its colour.
+
+        turn : False holds the normals, and fits the rest.
+        """
         normals, albedo = own(guess.normals), own(guess.albedo)
+        base = None if guess.base is None else own(guess.base)
         exposures, bsdf = own(guess.exposures), bsdf_of(self.lobes, guess.weights)
         for _ in range(steps):
-            normals, albedo = self._step(normals, albedo, exposures, bsdf, free_albedo)
+            pixel = _Pixel(self, normals, albedo, base, guess.base_eta)
+            sums = self._sums(pixel, exposures, bsdf)
+            normals, albedo, base = pixel.stepped(sums, free_albedo=free_albedo, turn=turn)
         guess.normals = np.array(normals, np.float64).reshape(-1, 3)
         guess.albedo = np.array(albedo, np.float64)
+        if base is not None:
+            guess.base = np.array(base, np.float64).reshape(-1, 3)
 
-    def _step(self, normals, albedo, exposures, bsdf, free_albedo: bool) -> tuple[mi.Float, mi.Float]:
-        p = dr.arange(mi.UInt32, self.P)
-        n, a = dr.gather(mi.Vector3f, normals, p), dr.gather(mi.Float, albedo, p)
-        point = dr.gather(mi.Point3f, self.points, p)
-        v = self.view(point)
-        frame = mi.Frame3f(n)
-        turned = [dr.normalize(n + TURN * t) for t in (frame.s, frame.t)]
+    def _sums(self, pixel: _Pixel, exposures: mi.Float, bsdf: mi.BSDF) -> list[mi.Float]:
+        """Over the lights, of what the equations of `_Pixel.stepped` are made: products of the two derivatives with
+        respect to turns and of the residual; then those with the derivatives with respect to what is linear."""
+        p, v = pixel.number, pixel.view
+        coloured = pixel.base is not None
+        turned = [dr.normalize(pixel.n + TURN * t) for t in (pixel.frame.s, pixel.frame.t)]
         threshold = dr.opaque(mi.Float, HUBER * self.scale)
         # Of values that are tiny, as under LEDs in millimetres, the determinant of products would be 0
         unit = dr.opaque(mi.Float, 1 / max(self.scale, 1e-15) ** 2)
 
         def body(k, *sums):
-            direction, irradiance = self.light(k, point)
+            direction, irradiance = self.light(k, pixel.point)
             entry = p * self.K + k
             scale = dr.gather(mi.Float, exposures, k) * irradiance
-            f = self._reflected(bsdf, n, v, direction) * scale
-            residual = dr.gather(mi.Color3f, self.values, entry) - a * f
+
+            def parts(n):
+                """Without colour and albedo: what is linear in them; and with these, all."""
+                f = self._reflected(bsdf, n, v, direction) * scale
+                if not coloured:
+                    return f, pixel.a * f
+                g = diffuse(pixel.base_eta, n, v, direction) * scale
+                return g, pixel.a * f + pixel.base * g
+
+            linear, total = parts(pixel.n)
+            residual = dr.gather(mi.Color3f, self.values, entry) - total
             if self.indirect is not None:
                 residual -= dr.gather(mi.Color3f, self.indirect, entry)
-            columns = [(self._reflected(bsdf, t, v, direction) * scale - f) * (a / TURN) for t in turned]
-            columns.append(f)
+            columns = [(parts(t)[1] - total) / TURN for t in turned]
             size = dr.norm(mi.Vector3f(residual))
             w = dr.gather(mi.Float, self.counts, entry) * dr.minimum(1, threshold / dr.maximum(size, 1e-20)) * unit
-            products = [w * dr.sum(columns[i] * columns[j]) for i in range(3) for j in range(i, 3)]
-            products += [w * dr.sum(c * residual) for c in columns]
+            u, t = columns
+            products = [w * dr.sum(x) for x in (u * u, u * t, t * t, u * residual, t * residual)]
+            if coloured:  # each colour has an unknown of its own
+                products += [w * linear * linear]
+                products += [w * linear * x[c] for x in (u, t, residual) for c in range(3)]
+            else:
+                products += [w * dr.sum(linear * x) for x in (linear, u, t, residual)]
             return k + 1, *(s + x for s, x in zip(sums, products, strict=True))
 
-        state = (dr.zeros(mi.UInt32, self.P), *(dr.zeros(mi.Float, self.P) for _ in range(9)))
-        _, uu, uv, ua, vv, va, aa, bu, bv, ba = dr.while_loop(state, lambda k, *_: k < self.K, body, label="lights")
-        if not free_albedo:
-            ua, va, ba, aa = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(1)
-        raised = lambda x: x * DAMPING + 1e-12
-        M = mi.Matrix3f([[raised(uu), uv, ua], [uv, raised(vv), va], [ua, va, raised(aa)]])
-        x = dr.rcp(M) @ mi.Vector3f(bu, bv, ba)
-        x = dr.select(dr.all(dr.isfinite(x)), x, 0)  # no value of the pixel counts: it stays as it is
-        length = dr.hypot(x.x, x.y)
-        x *= dr.minimum(1, LONGEST / dr.maximum(length, 1e-20))
-        n = dr.normalize(n + x.x * frame.s + x.y * frame.t)
-        # What the camera sees faces it
-        away = dr.maximum(-dr.dot(n, v), 0) + 1e-3
-        n = dr.select(dr.dot(n, v) > 1e-3, n, dr.normalize(n + away * v))
-        result = dr.ravel(n), dr.clip(a + x.z, *ALBEDOS)
-        dr.eval(result)
-        return result
+        state = (dr.zeros(mi.UInt32, self.P), *(dr.zeros(mi.Float, self.P) for _ in range(15 if coloured else 9)))
+        return list(dr.while_loop(state, lambda k, *_: k < self.K, body, label="lights"))[1:]
 
     # ---------------------- BSDF ----------------------
 
-    def fit_bsdf(self, guess: Guess, rng: np.random.Generator, *, coat: bool | None = None) -> None:
-        """Weights of the dictionary by non-negative least squares with a sum of at most 1, in place.
+    def fit_bsdf(self, guess: Guess, rng: np.random.Generator, *, coat: bool = False, turn: bool = True) -> None:
+        """Weights of the dictionary by non-negative least squares with a sum of at most 1, in place; where pixels have
+        a diffuse colour of their own, only those of glossy lobes.
 
-        coat : may diffuse light be that under a coat? None: if there is evidence.
+        coat : may diffuse light be that under a coat? turn : may normals?
 
         Normals lean to make up for a wrong BSDF, and the BSDF for wrong normals. So it is found as it would be if the
-        normals followed: what turns of them explain is left out (variable projection, Golub and Pereyra 1973).
+        normals followed, and the colours: what these explain is left out (variable projection, Golub and Pereyra 1973).
         """
         pixels = rng.choice(self.P, min(SAMPLED, self.P), replace=False)
         count, B = len(pixels), len(self.lobes)
@@ -219,49 +238,115 @@ class DirectModel:
         point = dr.gather(mi.Point3f, self.points, p)
         normal, view = dr.gather(mi.Vector3f, own(guess.normals), p), self.view(point)
         direction, irradiance = self.light(k, point)
-        scale = dr.gather(mi.Float, own(guess.albedo), p) * dr.gather(mi.Float, own(guess.exposures), k) * irradiance
+        scale = dr.gather(mi.Float, own(guess.exposures), k) * irradiance
+        albedo = dr.gather(mi.Float, own(guess.albedo), p)
 
-        def design(n: mi.Vector3f) -> np.ndarray:
+        def design(n: mi.Vector3f) -> tuple[np.ndarray, np.ndarray]:
+            """Of the lobes, (count K, B), and of what is a pixel's own, (count K,)."""
             frame = mi.Frame3f(n)
             wo = frame.to_local(direction)
             factor = scale * dr.maximum(wo.z, 0)
-            return np.array([f * factor for f in ggx.lobes(self.lobes, frame.to_local(view), wo)], np.float64).T
+            found = [f * factor * albedo for f in ggx.lobes(self.lobes, frame.to_local(view), wo)]
+            own_part = scale * diffuse(guess.base_eta, n, view, direction)
+            return np.array(found, np.float64).T, np.array(own_part, np.float64)
+
+        base = None if guess.base is None else np.repeat(guess.base[pixels], self.K, axis=0)
+
+        def total(D: np.ndarray, g: np.ndarray) -> np.ndarray:
+            return D @ guess.weights + (0 if base is None else base * g[:, None])
 
         frame = mi.Frame3f(normal)
-        D = design(normal)  # (count K, B)
+        D, g = design(normal)
         entry = p * self.K + k
         values, counts = dr.gather(mi.Color3f, self.values, entry), dr.gather(mi.Float, self.counts, entry)
         if self.indirect is not None:
             values -= dr.gather(mi.Color3f, self.indirect, entry)
         values, counts = np.array(values, np.float64).T, np.array(counts, np.float64)
-        residual = values - D @ guess.weights
-        counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(residual, axis=1), 1e-20))
-        turned = [(design(dr.normalize(normal + TURN * t)) - D) @ guess.weights / TURN for t in (frame.s, frame.t)]
-        per_pixel = (a.reshape(count, self.K, *a.shape[1:]) for a in (D, np.stack(turned, -1), values, counts))
-        gram, moments, squares = without_turns(*per_pixel)
+        here = total(D, g)
+        counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(values - here, axis=1), 1e-20))
+        own_columns = [(total(*design(dr.normalize(normal + TURN * t))) - here) / TURN for t in (frame.s, frame.t)]
+        own_columns = own_columns if turn else []
+        if base is None:
+            held = np.zeros_like(values)
+        else:
+            own_columns += [g[:, None] * colour for colour in np.eye(3)]
+            held = base * g[:, None]
+        values -= held
+        columns = np.stack(own_columns, -1) if own_columns else np.zeros((*values.shape, 0))
+        per_pixel = (a.reshape(count, self.K, *a.shape[1:]) for a in (D, columns, values, counts))
+        gram, moments, _ = without_turns(*per_pixel)
         colours = values.shape[1]
-
-        def solved(wanted: np.ndarray) -> tuple[float, np.ndarray]:
-            """What is left of the squares, and weights, with these lobes."""
-            i, x = np.flatnonzero(np.tile(wanted, colours)), np.zeros(colours * B)
-            x[i] = simplex_least_squares(gram[np.ix_(i, i)], moments[i], colours)
-            return squares + x @ gram @ x - 2 * moments @ x, x.reshape(colours, B).T
-
         alpha, eta = np.array(self.lobes.alpha), np.array(self.lobes.eta)
-        coated = np.isnan(alpha) & ~np.isnan(eta)
-        left, guess.weights = solved(~coated)
-        if coat is not False and coated.any():
-            with_coat, weights = solved(~np.zeros_like(coated))
-            if coat or with_coat < EVIDENCE * left:
-                guess.weights = weights
+        wanted = ~(np.isnan(alpha) & ~np.isnan(eta)) | coat
+        if base is not None:  # a glaze reflects all colours alike
+            fold = np.tile(np.eye(B), (colours, 1))
+            gram, moments, wanted = fold.T @ gram @ fold, fold.T @ moments, ~np.isnan(alpha)
+        parts = len(moments) // B
+        i, x = np.flatnonzero(np.tile(wanted, parts)), np.zeros(parts * B)
+        if i.size:
+            x[i] = simplex_least_squares(gram[np.ix_(i, i)], moments[i], parts)
+        guess.weights = np.broadcast_to(x.reshape(parts, B).T, (B, colours)).copy()
+
+
+@dataclass
+class _Pixel:
+    """All pixels, each with what it has of its own, as one step of Gauss and Newton begins."""
+
+    model: DirectModel
+    normals: mi.Float
+    albedo: mi.Float
+    colours: mi.Float | None
+    base_eta: float
+
+    def __post_init__(self):
+        self.number = p = dr.arange(mi.UInt32, self.model.P)
+        self.n, self.a = dr.gather(mi.Vector3f, self.normals, p), dr.gather(mi.Float, self.albedo, p)
+        self.base = None if self.colours is None else dr.gather(mi.Color3f, self.colours, p)
+        self.point = dr.gather(mi.Point3f, self.model.points, p)
+        self.view, self.frame = self.model.view(self.point), mi.Frame3f(self.n)
+
+    def stepped(self, sums: list[mi.Float], *, free_albedo: bool, turn: bool) -> tuple:
+        """Normals, albedo and colours after a step, of `DirectModel._sums`. What is linear is eliminated."""
+        uu, uv, vv, bu, bv, ll, *rest = sums
+        count = 1 if self.base is None else 3
+        lu, lv, lb = rest[:count], rest[count : 2 * count], rest[2 * count :]
+        free = 1 if free_albedo or self.base is not None else 0
+        inverse = free / (ll * DAMPING + 1e-12)
+        less = lambda x, y: sum(a * b for a, b in zip(x, y, strict=True)) * inverse
+        uu, vv = uu * DAMPING + 1e-12 - less(lu, lu), vv * DAMPING + 1e-12 - less(lv, lv)
+        uv, bu, bv = uv - less(lu, lv), bu - less(lu, lb), bv - less(lv, lb)
+        x = dr.rcp(mi.Matrix2f([[uu, uv], [uv, vv]])) @ mi.Vector2f(bu, bv)
+        x = dr.select(dr.all(dr.isfinite(x)) & turn, x, 0)
+        x *= dr.minimum(1, LONGEST / dr.maximum(dr.hypot(x.x, x.y), 1e-20))
+        n, v = dr.normalize(self.n + x.x * self.frame.s + x.y * self.frame.t), self.view
+        # What the camera sees faces it
+        away = dr.maximum(-dr.dot(n, v), 0) + 1e-3
+        n = dr.select(dr.dot(n, v) > 1e-3, n, dr.normalize(n + away * v))
+        linear = [(b - x.x * u - x.y * w) * inverse for b, u, w in zip(lb, lu, lv, strict=True)]
+        linear = [dr.select(dr.isfinite(step), step, 0) for step in linear]  # no value of the pixel counts: as it is
+        albedo, base = self.a, None
+        if self.base is None:
+            albedo = dr.clip(self.a + linear[0], *ALBEDOS)
+        else:
+            base = dr.ravel(dr.clip(self.base + mi.Color3f(*linear), 0, LIGHTEST))
+        result = dr.ravel(n), albedo, base
+        dr.eval(result)
+        return result
+
+
+def diffuse(eta: float, n: mi.Vector3f, v: mi.Vector3f, direction: mi.Vector3f) -> mi.Float:
+    """Of a diffuse lobe, its value times the cosine, where light and camera are in front of the surface."""
+    cos_i, cos_o = dr.dot(n, v), dr.dot(n, direction)
+    return dr.select((cos_i > 0) & (cos_o > 0), ggx.diffuse(eta, cos_i, cos_o) * cos_o, 0)
 
 
 def without_turns(
     lobes: np.ndarray, turns: np.ndarray, values: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Normal equations of weights x, (C B,) for C colours, as if the normals of all pixels followed.
+    """Normal equations of weights x, (C B,) for C colours, as if T numbers of each pixel followed, such as its normal.
 
-    lobes : (P, K, B). turns : changes of the values as normals turn, (P, K, C, 2). values : (P, K, C). counts : (P, K).
+    lobes : (P, K, B). turns : changes of the values with these numbers, (P, K, C, T). values : (P, K, C).
+    counts : (P, K).
 
     Returns
     -------
@@ -271,11 +356,12 @@ def without_turns(
     weighted = lobes * counts[..., None]
     counted = turns * counts[..., None, None]
     A = np.einsum("pkci,pkcj->pij", counted, turns)
-    A[:, [0, 1], [0, 1]] = A[:, [0, 1], [0, 1]] * DAMPING + 1e-20
+    diagonal = np.arange(turns.shape[3])
+    A[:, diagonal, diagonal] = A[:, diagonal, diagonal] * DAMPING + 1e-20
     of_lobes = np.stack([np.swapaxes(lobes, 1, 2) @ counted[:, :, c] for c in range(colours)], 1)
-    of_lobes = of_lobes.reshape(P, colours * B, 2)
+    of_lobes = of_lobes.reshape(P, colours * B, len(diagonal))
     of_values = np.einsum("pkci,pkc->pi", counted, values)
-    explained = np.linalg.solve(A, np.swapaxes(of_lobes, 1, 2))  # (P, 2, C B)
+    explained = np.linalg.solve(A, np.swapaxes(of_lobes, 1, 2))  # (P, T, C B)
     gram = np.kron(np.eye(colours), np.tensordot(weighted, lobes, ((0, 1), (0, 1))))
     gram -= np.tensordot(of_lobes, explained, ((0, 2), (0, 1)))
     moments = np.tensordot(values, weighted, ((0, 1), (0, 1))).ravel() - np.tensordot(of_values, explained, 2)
@@ -301,11 +387,15 @@ def simplex_least_squares(gram: np.ndarray, moments: np.ndarray, colours: int = 
     return (x / np.maximum(x.sum(1, keepdims=True), 1)).ravel()
 
 
-def bsdf_of(lobes: ggx.Lobes, weights: np.ndarray, scale: str | None = None) -> mi.BSDF:
-    """A `ggx_dictionary`. scale : attribute of a mesh, with which it is multiplied."""
+def bsdf_of(
+    lobes: ggx.Lobes, weights: np.ndarray, *, scale: str | None = None, base: str | None = None, eta: float = np.nan
+) -> mi.BSDF:
+    """A `ggx_dictionary`. scale, base : attributes of a mesh, see there. eta : of the coat over the base."""
+    attributes = {"scale": scale, "base": base}
     return mi.load_dict(
         {
-            **({} if scale is None else {"scale": {"type": "mesh_attribute", "name": scale}}),
+            **{key: {"type": "mesh_attribute", "name": name} for key, name in attributes.items() if name is not None},
+            **({} if base is None else {"base_eta": eta}),
             "type": "ggx_dictionary",
             "alpha": mi.Float(list(lobes.alpha)),
             "eta": mi.Float(list(lobes.eta)),

@@ -7,7 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from .dataset import unit
+from .vectors import unit
+
+#: Trimming leaves at least so many values of a pixel, and lights that are spread at least this part as far (smallest
+#: eigenvalue of the mean of their products) as all of them: else the pixel keeps all its values.
+FEWEST, SPREAD = 4, 0.05
+
+#: Directions whose third singular value is less than this part of the first are taken to lie in a plane.
+PLANE = 1e-3
 
 #: Iterations of reweighted least squares, and the part of a pixel's mean size below which residuals count as small.
 ITERATIONS, SMALL = 30, 1e-3
@@ -31,9 +38,39 @@ def ranks(values: np.ndarray) -> np.ndarray:
 
 
 def trimmed(values: np.ndarray, lights: np.ndarray, low: float = 0.2, high: float = 0.8) -> np.ndarray:
-    """Least squares without the darkest and the brightest values of each pixel: (P, 3)."""
+    """Least squares without the darkest and the brightest values of each pixel, where what is left tells all three
+    numbers: (P, 3)."""
     rank = ranks(values)
-    return least_squares(values, lights, ((rank >= low) & (rank <= high)).astype(values.dtype))
+    kept = (rank >= low) & (rank <= high)
+    kept |= ~telling(kept, lights)[:, None]
+    return least_squares(values, lights, kept.astype(values.dtype))
+
+
+def telling(kept: np.ndarray, lights: np.ndarray) -> np.ndarray:
+    """Are there enough values of each pixel, and do their lights lie apart? (P,)"""
+    wide = "ki,kj" if lights.ndim == 2 else "pki,pkj"
+    spread = lambda w: np.linalg.eigvalsh(
+        np.einsum(f"pk,{wide}->pij", w / np.maximum(w.sum(1, keepdims=True), 1), lights, lights, optimize=True)
+    )[:, 0]
+    enough = kept.sum(1) >= FEWEST
+    return enough & (spread(kept.astype(float)) >= SPREAD * spread(np.ones(kept.shape)))
+
+
+def brightest(values: np.ndarray, dark: float) -> np.ndarray:
+    """Which values of each pixel are not among its darkest, of which `dark` is the part: (P, K), bool. At least four of
+    a pixel are left, or all."""
+    last = values.shape[1] - 1
+    return ranks(values) * last >= min(dark * last, last + 1 - FEWEST) - 1e-9
+
+
+def check_lights(lights: np.ndarray) -> None:
+    """Raises ValueError if directions, (K, 3), lie in a plane, and so do not tell normals apart."""
+    size = np.linalg.svd(lights, compute_uv=False)
+    if size[2] < PLANE * size[0]:
+        raise ValueError(
+            "ps: the directions of the lights are all equal, or lie in a plane, so that normals cannot be told; "
+            "check light_directions.txt, and that the lights chosen are not in a row"
+        )
 
 
 def reweighted(values: np.ndarray, lights: np.ndarray) -> np.ndarray:
@@ -62,5 +99,10 @@ def normals(values: np.ndarray, lights: np.ndarray, method: str = "trimmed") -> 
     """
     if method not in METHODS:
         raise ValueError(f'ps: unknown method "{method}", expected one of {", ".join(METHODS)}')
-    n = unit(METHODS[method](values.astype(np.float64), lights))
+    return facing(METHODS[method](values.astype(np.float64), lights))
+
+
+def facing(b: np.ndarray) -> np.ndarray:
+    """Unit normals of albedo times normal, (P, 3), on the side of the camera."""
+    n = unit(b)
     return np.where(n[:, 2:] < 0, n * [1, 1, -1], n)

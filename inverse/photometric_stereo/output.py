@@ -39,8 +39,9 @@ def write_numbers(
 ) -> None:
     """Write what was found, each file at once: after an alternation, say, lest it is lost.
 
-    ``normals.exr``, ``depth.exr``, ``albedo.exr``: 0 outside the mask, at the resolution reached. ``bsdf.json``: for
-    the plugin ``ggx_dictionary``, see `bsdf`. ``exposures.txt``: a line for each image. ``metadata.json``.
+    ``normals.exr``, ``depth.exr``, ``albedo.exr``, of several materials ``base.exr``: 0 outside the mask, at the
+    resolution reached. ``bsdf.json``: for the plugin ``ggx_dictionary``, see `bsdf`. ``exposures.txt``: a line for
+    each image. ``metadata.json``.
 
     status : "running", "finished" or "interrupted". truth : (H, W), of depth.
 
@@ -58,6 +59,9 @@ def write_numbers(
     write_exr(folder / "normals.exr", {"": data.image(guess.normals)}, {"axes": "x right, y up, z towards the camera"})
     write_exr(folder / "depth.exr", {"": data.image(depth(result))[..., None]}, {"unit": unit})
     write_exr(folder / "albedo.exr", {"": data.image(guess.albedo)[..., None]}, {"unit": "of bsdf.json"})
+    if guess.base is not None:
+        unit_of_base = {"unit": "diffuse colour, of the images", "coat": f"index of refraction {guess.base_eta:g}"}
+        write_exr(folder / "base.exr", {"": data.image(guess.base / result.scale)}, unit_of_base)
     weights, factor = bsdf(result)
     with replacing(folder / "bsdf.json") as temporary:
         ggx.write(temporary, result.lobes, weights)
@@ -67,6 +71,9 @@ def write_numbers(
         "status": status,
         "mean_angular_error_degrees": result.error,
         "depth_error": error_of_depth(result, truth),
+        "verdict": result.verdict,
+        "materials": "one" if guess.base is None else "several",
+        "left_out": {name: None if np.isnan(error) else error for name, error in result.left_out.items()},
         "seconds": round(result.seconds, 3),
         "size": [*data.mask.shape[::-1]],
         "pixels": len(data.values),
@@ -104,6 +111,16 @@ def write_pictures(folder: Path, result: Result) -> None:
 
 
 # ---------------------- Parts of a result ----------------------
+
+
+def judgement(result: Result) -> list[str]:
+    """What the values that were left out say, in sentences; nothing before the last alternation."""
+    if result.verdict == "not judged":
+        return ["too few lights to leave any out: the last alternation was kept"] if result.left_out else []
+    start, found = (f"{100 * result.left_out[name]:.3g} %" for name in ("start", "result"))
+    if result.verdict == "start":
+        return [f"the start is kept, for it predicts values that were left out as well as anything: {start} off"]
+    return [f"values that were left out are predicted {found} off, by the start {start}"]
 
 
 def depth(result: Result) -> np.ndarray:
@@ -175,8 +192,9 @@ def bsdf_figure(result: Result) -> Figure:
             axes.plot(outgoing, values, color=page.COLOURS[i], linewidth=1.3, label=f"θᵢ = {incidence}°")
         axes.set(xlabel="θₒ, degrees", ylabel="" if c else "f cos θₒ, 1/sr")
         axes.set_title(colour, fontsize=9, color=page.INK)
-        axes.set_yscale("log")
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], axes.get_ylim()[1] * 1e-4))
+        if weights.any():  # else there is no glaze over the diffuse colours
+            axes.set_yscale("log")
+            axes.set_ylim(bottom=max(axes.get_ylim()[0], axes.get_ylim()[1] * 1e-4))
         page.paint(axes)
         if c == 0:
             axes.legend(fontsize=7.5, labelcolor=page.INK, framealpha=0, edgecolor="none")

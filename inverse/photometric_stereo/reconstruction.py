@@ -7,7 +7,9 @@ alternation makes the interreflections of a better surface, and so on (Nayar et 
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,22 +22,21 @@ from tqdm import tqdm
 from rimlight import ggx
 
 from . import calibration, least_squares
-from .dataset import LUMINANCE, Dataset, angles, unit
+from .alternation import Alternations, State
+from .dataset import Dataset, angles, unit
 from .direct import DirectModel, Guess
+from .evidence import Judge, Kind, left_out
 from .refinement import Descent, descend
 from .rendering import Domain, Rendering
 
-#: Share of the newest interreflections in their running mean.
-AVERAGED = 0.25
+log = logging.getLogger(__name__)
 
-#: Exposures that seem to be off by less (logarithm) are taken as stated: shapes and BSDFs explain so much as well.
-STATED = 0.02
+#: Pixels without which there is no surface.
+FEWEST = 9
 
-#: Alternations before a coat is thought of: with the normals of the start, anything may look like one.
+#: Alternations of each kind of material, from the best state of the simplest: with the normals of the start, anything
+#: may look like a coat.
 SETTLED = 3
-
-#: Fits of the BSDF and of normals in turns, in each alternation: rendering takes longer.
-INNER = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +53,10 @@ class Options:
     reflectance: bool = True
     """Fit the BSDF. Otherwise the surface is Lambertian, and only its colour is fitted."""
     coat: bool | None = None
-    """May light be diffuse under a smooth coat, as that of plastics? Default: if there is strong evidence."""
+    """May light be diffuse under a smooth coat, as that of plastics? Default: if that predicts better."""
+    materials: Literal["one", "several"] | None = None
+    """One material, with a factor for each pixel; or several under one glaze: a diffuse colour for each pixel, and
+    highlights that all share. Default: what predicts better."""
     albedo: bool = True
     """A factor of the BSDF for each pixel."""
     exposures: bool = True
@@ -102,10 +106,21 @@ class Options:
                 f"{self.max_depth}, {self.spp}, {self.smoothing}"
             )
 
+    def kinds(self) -> tuple[Kind, ...]:
+        """Of material, that are tried."""
+        if not self.reflectance:
+            return (Kind(),)
+        several = (False, True) if self.materials is None and self.albedo else (self.materials == "several",)
+        coat = (False, True) if self.coat is None else (self.coat,)
+        return tuple(Kind(s, c) for s in several for c in coat)
+
 
 @dataclass
 class Result:
     """normals : (P, 3). depth : (Q,), of the pixels of `domain`. weights : (B, 3), with `scale` the BSDF of the images.
+    kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and so was kept;
+    "judged", if something else predicts better; "not judged", with too few lights to leave any out. left_out : how far
+    predictions of "start" and "result" are off, in the mean value of each pixel.
     history : for each alternation, the size of the images, seconds since the start, the root mean square residual over
     the median value, and where the truth is known the mean angular error, degrees."""
 
@@ -116,8 +131,25 @@ class Result:
     domain: object
     start: np.ndarray
     scale: float
+    kind: Kind
+    verdict: str = "not judged"
+    left_out: dict[str, float] = field(default_factory=dict)
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
+
+    def take(self, state: State) -> None:
+        """Take over a state of an alternation."""
+        self.guess, self.depth, self.kind = state.guess, state.depth, state.kind
+
+    @property
+    def normal_map(self) -> np.ndarray:
+        """(H, W, 3), 0 outside the mask."""
+        return self.data.image(self.guess.normals)
+
+    @property
+    def depth_map(self) -> np.ndarray:
+        """(H, W), NaN outside the mask."""
+        return self.data.image(self.depth[self.domain.inner], np.nan)
 
     @property
     def error(self) -> float | None:
@@ -130,19 +162,29 @@ def reconstruct(
 ) -> Result:
     """Normals, depth and reflectance of a data set.
 
+    Of all states, the one is returned that best predicts values that were left out. `Result.verdict` says if it is the
+    start.
+
     after : called with the result so far after each alternation.
+
+    Raises
+    ------
+    ValueError : lights lie in a plane, all images are black, or the mask has hardly any pixels.
     """
     options, begin = options or Options(), time.perf_counter()
     lobes, _ = ggx.read_dictionary()
     if not options.reflectance:
         lobes = ggx.Lobes((np.nan,), (np.nan,))
+    _check(data)
     rng = np.random.default_rng(options.seed)
     scale = _scale(data.at(options.resolutions[0]), options)
-    result: Result | None = None
-    coarse, rendering = 1, None
-    bar = tqdm(total=sum(options.iterations) + options.descent.steps, desc="ps", disable=not progress)
+    result, coarse = None, 1
+    kinds = options.kinds()
+    others = SETTLED * len(kinds) if len(kinds) > 1 else 0
+    bar = tqdm(total=sum(options.iterations) + others + options.descent.steps, desc="ps", disable=not progress)
 
-    def record(size: float, residual: float) -> None:
+    def record(state: State, residual: float) -> None:
+        result.take(state)
         result.seconds = time.perf_counter() - begin
         entry = {"size": size, "seconds": result.seconds, "residual": residual}
         if result.data.truth is not None:
@@ -156,69 +198,64 @@ def reconstruct(
     for size, most in zip(options.resolutions, options.iterations, strict=True):
         level = data.at(size)
         level = dataclasses.replace(level, values=level.values * np.float32(scale))
-        counts = (least_squares.ranks(level.luminance) >= options.dark).astype(np.float32)
-        del rendering  # and so its BSDF: see `Rendering`
-        rendering = Rendering(level, lobes, max_depth=options.max_depth)
-        model = DirectModel(level, lobes, counts=counts)
+        counts = _counts(data, level, size, options.dark)
+        judge = Judge(level, lobes, left_out(level, options.seed), counts, options.seed, options.start)
+        kind = kinds[0] if result is None else result.kind
+        work = Alternations(level, lobes, kind, judge, options, rng)
+        guess = _start(level, lobes, counts, options)
+        start, seen = work.judged_start(guess, _flat(level).lighting()[0], kinds)
         if result is None:
-            guess = _start(level, lobes, counts, options)
-            result = Result(level, lobes, guess, np.empty(0), rendering.domain, guess.normals, scale)
+            result = Result(level, lobes, guess, start.depth, work.domain, guess.normals, scale, kind)
+            first = copy.deepcopy(start)
+            if kind.several:  # which is another guess
+                seen = None
         else:
             _refine(result, level, before=coarse, now=round(1 / size))
-            guess = result.guess
-        result.data, result.domain, coarse = level, rendering.domain, round(1 / size)
-        result.depth = rendering.domain.integrate(guess.normals, options.bilateral)
-        indirect = None
-        for i in range(most):
-            before = guess.normals
-            rendering.update(guess, result.depth)
-            if options.max_depth > 2:
-                # The mean of the last ones: less noise, and as the surface hardly changes, hardly older
-                new = rendering.indirect(spp=options.spp, seed=int(rng.integers(2**31)))
-                _smooth(new, level.mask, options.smoothing)
-                if indirect is None:
-                    indirect = new
-                else:
-                    new -= indirect
-                    new *= max(1 / (i + 1), AVERAGED)
-                    indirect += new
-                del new
-            seen = counts * rendering.visible(model) if options.shadows else counts
-            points = rendering.domain.points(result.depth)
-            model = DirectModel(level, lobes, points=points, counts=seen, indirect=indirect)
-            coat = False if options.coat is None and len(result.history) < SETTLED else options.coat
-            for _ in range(INNER):
-                model.fit_bsdf(guess, rng, coat=coat)
-                model.fit_normals(guess, steps=2, free_albedo=options.albedo)
-            residual = _exposures(model, guess, level, seen, rng, options)
-            result.depth = rendering.domain.integrate(guess.normals, options.bilateral)
-            turned = float(angles(before, guess.normals).mean())
-            record(size, residual)
-            if turned < options.tolerance:
-                break
+            first = State(result.guess, work.domain.integrate(result.guess.normals, options.bilateral), kind)
+            seen = None
+        result.data, result.domain, coarse = level, work.domain, round(1 / size)
+        best = work.run(first, most, record, seen)
+        if size == options.resolutions[0]:
+            settled = best
+            for kind in kinds if judge.able and len(kinds) > 1 else ():
+                del work
+                work = Alternations(level, lobes, kind, judge, options, rng)
+                again = dataclasses.replace(copy.deepcopy(settled), left_out=np.nan)
+                found = work.run(again, SETTLED, record)
+                if found.better_than(best) if kind == best.kind else found.needed_beside(best):
+                    best = found
+        if start.left_out < best.left_out:
+            best = start
+        result.take(best)
+        result.left_out = {"start": start.left_out, "result": best.left_out}
+    result.verdict = "start" if best.start else "judged" if judge.able else "not judged"
     if options.descent.steps:
-
-        def note(depth: np.ndarray, residual: float) -> None:
-            result.depth = depth
-            record(size, residual)
-
-        counted = np.ones_like(counts) if options.descent.depth_rate else seen
-        if options.descent.lights:
-            del rendering
-            rendering = Rendering(level, lobes, max_depth=options.max_depth, lights=options.descent.lights)
-        descend(
-            rendering,
-            level,
-            guess,
-            result.depth,
-            counted,
-            options.descent,
-            rng,
-            bilateral=options.bilateral,
-            after=note,
-        )
+        _descend(result, work, record, rng)
     bar.close()
     return result
+
+
+def _counts(data: Dataset, level: Dataset, size: float, dark: float) -> np.ndarray:
+    """How much values of a level count, (P, K): 0 for the darkest of each pixel, and what is clipped, even in part."""
+    clipped = data.clipped
+    if size < 1:
+        clipped = data.blocks(round(1 / size))[1](clipped.astype(np.float32)) > 0
+    return (least_squares.brightest(level.luminance, dark) & ~clipped).astype(np.float32)
+
+
+def _check(data: Dataset) -> None:
+    """Raises ValueError for data that tell nothing; logs what makes them tell less."""
+    if not data.near:
+        least_squares.check_lights(data.lights)
+    if not data.values.max() > 0:
+        raise ValueError("ps: all images are black in the mask; check the images, their exposure and the mask")
+    if len(data.values) < FEWEST:
+        raise ValueError(f"ps: the mask has {len(data.values)} pixels, at least {FEWEST} are needed; check mask.png")
+    if share := data.clipped.mean():
+        log.warning(
+            "ps: %.2g %% of the values are clipped: they equal the largest one, and do not count; expose less",
+            100 * share,
+        )
 
 
 def _scale(data: Dataset, options: Options) -> float:
@@ -248,54 +285,61 @@ def _start(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options
     directions, irradiance = flat.lighting()
     values = _over(data.luminance, irradiance)
     solve = least_squares.METHODS[options.start]
+    if data.clipped.any():  # what is too bright is known then, and need not be guessed
+        told = least_squares.telling(counts > 0, directions)[:, None]
+        solve = lambda values, lights: least_squares.least_squares(values, lights, np.where(told, counts, 1.0))
     exposures = np.ones(flat.K)
     for _ in range(3 if options.exposures else 0):
         predicted = least_squares.predicted(solve(values / exposures, directions), directions)
         exposures *= calibration.exposures(values / exposures, predicted, counts, flat.mean_directions())
-    normals = least_squares.normals(values / exposures, directions, options.start)
-    albedo = np.linalg.norm(solve(values / exposures, directions), axis=1)
+    found = solve((values / exposures).astype(np.float64), directions)
+    normals, albedo = least_squares.facing(found), np.linalg.norm(found, axis=1)
     weights = np.zeros((len(lobes), 3))
     colour = (data.values / exposures[:, None]).mean((0, 1)) / (data.luminance / exposures).mean()
     weights[np.isnan(lobes.eta)] = np.minimum(np.pi * np.median(albedo) * colour, 1)
     return Guess(normals, np.ones(len(values)), exposures, weights)
 
 
-def _exposures(model, guess, data, counts, rng, options) -> float:
-    """Take the albedo's median and the exposures' to be 1. Returns the relative residual."""
-    if options.albedo:
-        guess.albedo /= np.median(guess.albedo)
-    pixels = rng.choice(model.P, min(2000, model.P), replace=False)
-    predicted = model.predicted(guess, pixels)
-    w = counts[pixels]
-    residual = np.sqrt((w[..., None] * (predicted - data.values[pixels]) ** 2).sum() / w.sum() / 3) / model.scale
-    if options.exposures:
-        guess.exposures *= calibration.exposures(
-            data.luminance[pixels], predicted @ LUMINANCE, w, model.mean_directions()
-        )
-        guess.exposures[np.abs(np.log(guess.exposures)) < STATED] = 1
-    return float(residual)
-
-
-def _smooth(pixels: np.ndarray, mask: np.ndarray, width: float) -> None:
-    """Gaussian means over the pixels of the mask, of each image of (P, K, 3), in place."""
-    if not width:
-        return
-    share = ndimage.gaussian_filter(mask.astype(np.float32), width)[mask]
-    image = np.zeros((*mask.shape, 3), np.float32)
-    for k in range(pixels.shape[1]):
-        image[mask] = pixels[:, k]
-        pixels[:, k] = ndimage.gaussian_filter(image, (width, width, 0))[mask] / share[:, None]
-
-
 def _refine(result: Result, data: Dataset, *, before: int, now: int) -> None:
     """Take a guess to larger images. before, now : sides of their pixels, in those of the data."""
     rows, columns = np.nonzero(data.mask)
     domain = result.domain
-    padded = np.zeros((*domain.wide.shape, 4))
-    padded[domain.wide] = np.c_[result.guess.normals, result.guess.albedo][domain.nearest]
+    guess = result.guess
+    pixels = np.c_[guess.normals, guess.albedo, np.empty((len(guess.albedo), 0)) if guess.base is None else guess.base]
+    padded = np.zeros((*domain.wide.shape, pixels.shape[1]))
+    padded[domain.wide] = pixels[domain.nearest]
     _, nearest = ndimage.distance_transform_edt(~domain.wide, return_indices=True)
     padded = padded[nearest[0], nearest[1]]
     centre = lambda i: (now * i + (now - before) / 2) / before + 1  # the domain is larger by a pixel
     at = [centre(rows), centre(columns)]
-    fine = np.stack([ndimage.map_coordinates(padded[..., i], at, order=1, mode="nearest") for i in range(4)], -1)
-    result.guess.normals, result.guess.albedo = unit(fine[:, :3]), fine[:, 3]
+    fine = [ndimage.map_coordinates(padded[..., i], at, order=1, mode="nearest") for i in range(padded.shape[2])]
+    guess.normals, guess.albedo = unit(np.stack(fine[:3], 1)), fine[3]
+    if guess.base is not None:
+        guess.base = np.stack(fine[4:], 1)
+
+
+def _descend(result: Result, work: Alternations, record: Callable, rng: np.random.Generator) -> None:
+    """Steps along derivatives of path-traced images, from the best state."""
+    options, data, guess = work.options, result.data, result.guess
+    if work.kind != result.kind or options.descent.lights:
+        several, eta = result.kind.several, result.kind.base_eta(result.lobes)
+        work.rendering = Rendering(
+            data,
+            result.lobes,
+            max_depth=options.max_depth,
+            lights=options.descent.lights,
+            several=several,
+            base_eta=eta,
+        )
+    if options.descent.depth_rate:
+        counts = np.ones_like(work.judge.counts)
+    else:
+        work.rendering.update(guess, result.depth)
+        counts = work.judge.counts * (work.rendering.visible(work.flat) if options.shadows else 1)
+
+    def note(depth: np.ndarray, residual: float) -> None:
+        record(State(guess, depth, result.kind), residual)
+
+    descend(
+        work.rendering, data, guess, result.depth, counts, options.descent, rng, bilateral=options.bilateral, after=note
+    )

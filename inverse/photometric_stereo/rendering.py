@@ -75,6 +75,7 @@ class Rendering:
 
     max_depth : longest path: 2 is direct light, 3 adds one interreflection.
     lights : number of lights that are rendered at a time, the first ones until others are chosen. 0: all.
+    several, base_eta : of guesses with a diffuse colour of each pixel, see `Guess`.
 
     Raises
     ------
@@ -82,7 +83,16 @@ class Rendering:
         distances, of which all are rendered.
     """
 
-    def __init__(self, data: Dataset, lobes: ggx.Lobes, *, max_depth: int = 3, lights: int = 0):
+    def __init__(
+        self,
+        data: Dataset,
+        lobes: ggx.Lobes,
+        *,
+        max_depth: int = 3,
+        lights: int = 0,
+        several: bool = False,
+        base_eta: float = np.nan,
+    ):
         gc.collect()
         if not 0 <= lights <= len(data.lights) or (lights and data.near):
             raise ValueError(
@@ -94,9 +104,13 @@ class Rendering:
         vertices, faces = self.domain.mesh(np.ones(self.domain.wide.sum()))
         Q = len(vertices)
         props = mi.Properties()
-        props["mesh_bsdf"] = bsdf_of(lobes, np.zeros((len(lobes), 3)), scale="vertex_albedo")
+        self.several = several
+        base = "vertex_base" if several else None
+        props["mesh_bsdf"] = bsdf_of(lobes, np.zeros((len(lobes), 3)), scale="vertex_albedo", base=base, eta=base_eta)
         mesh = mi.Mesh("object", Q, len(faces), props, has_vertex_normals=True)
         mesh.add_attribute("vertex_albedo", 1, np.ones(Q, np.float32))
+        if several:
+            mesh.add_attribute("vertex_base", 3, np.ones(3 * Q, np.float32))
         params = mi.traverse(mesh)
         params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
         params["vertex_positions"] = own(vertices)
@@ -172,6 +186,8 @@ class Rendering:
             "vertex_albedo": own(guess.albedo[nearest]),
             "weights": mi.TensorXf(own(guess.weights), guess.weights.shape),
         }
+        if self.several:
+            self.params[self.key("vertex_base")] = own(guess.base[nearest])
         self._put()
         if self.data.near:
             for k, s in enumerate(guess.exposures):

@@ -94,7 +94,13 @@ class View:
         if not data.near:
             values = np.stack([mean(data.values[:, k] @ LUMINANCE) for k in range(len(data.lights))], 1)
             start = least_squares.normals(values / guess.exposures, data.lights, options.start)
-        found = Guess(unit(mean(guess.normals)), mean(guess.albedo), guess.exposures[chosen], guess.weights)
+        found = dataclasses.replace(
+            guess,
+            normals=unit(mean(guess.normals)),
+            albedo=mean(guess.albedo),
+            exposures=guess.exposures[chosen],
+            base=None if guess.base is None else mean(guess.base),
+        )
         rows, columns = np.nonzero(small.mask)
         crop = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
         return View(small, found, depth, chosen, start, crop)
@@ -136,6 +142,7 @@ def _verdict(view: View, result: Result, status: str) -> str:
         if view.start is not None:
             facts[-1] += f" (least squares: {angles(view.start, view.data.truth).mean():.2f}°)"
     facts.append(f"residual {number(100 * result.history[-1]['residual'], 2)} % of the median value")
+    facts += output.judgement(result)
     kind = "status" if status == "finished" else "status bad"
     return f'<p class="verdict"><span class="{kind}">{html.escape(status)}</span>: {html.escape("; ".join(facts))}</p>'
 
@@ -173,7 +180,8 @@ def _rendered(view: View, result: Result, options: Options) -> list[str]:
 
 
 def _render(view: View, result: Result, options: Options, data: Dataset, guess: Guess) -> np.ndarray:
-    rendering = Rendering(data, result.lobes, max_depth=options.max_depth)
+    several = guess.base is not None
+    rendering = Rendering(data, result.lobes, max_depth=options.max_depth, several=several, base_eta=guess.base_eta)
     rendering.update(guess, view.depth[rendering.domain.nearest])
     return rendering.image(spp=SPP, seed=options.seed)
 
@@ -237,7 +245,11 @@ def _reflectance(view: View, result: Result) -> str:
         lobe = "diffuse" if np.isnan(result.lobes.alpha[b]) else f"{result.lobes.alpha[b]:.3g}"
         rows.append((lobe, f"{result.lobes.eta[b]:.3g}", *(f"{w:.4f}" for w in weights[b])))
     note = "" if factor == 1 else f" times {number(factor)}"
-    albedo = _with_scale({"Albedo": view.guess.albedo}, view.image, f"factor of the BSDF{note}")
+    if view.guess.base is None:
+        albedo = _with_scale({"Albedo": view.guess.albedo}, view.image, f"factor of the BSDF{note}")
+    else:
+        colours = pictures.to_srgb(view.image(view.guess.base / max(float(view.guess.base.max()), 1e-12)))
+        albedo = f'<div class="maps">{_figure(colours, "Diffuse colours, the brightest is 1")}</div>'
     table = page.table(("alpha", "eta", "red", "green", "blue"), rows, "Weights of the lobes")
     return f"<section>\n<h2>Reflectance</h2>\n<figure>{plot}</figure>\n{albedo}\n<h3>Weights</h3>\n{table}\n</section>"
 

@@ -33,6 +33,12 @@ DETAIL = 3
 #: Width of the object over that of the image.
 FILLED = 0.88
 
+#: Standard deviation of the Gaussian that makes regions of noise, over the width of the image.
+REGION = 0.08
+
+#: Roughness (alpha of GGX) and index of refraction of a glaze.
+GLAZE = 0.08, 1.5
+
 #: Samples, times lights, of one launch: between launches, a progress bar can move.
 LAUNCH = 2**23
 
@@ -47,7 +53,8 @@ class Options:
     """
 
     shape: str = "sphere"
-    """"sphere", "bowl", or the file of a mesh, .obj or .ply, which is seen from its +z with y up."""
+    """"sphere", "bowl", "folds" (a dome with folds, which differ from seed to seed), or the file of a mesh,
+    .obj or .ply, which is seen from its +z with y up."""
     concave: bool = False
     """Mirror the surface in depth, which makes a mould of it."""
     hollow: float = 0.32
@@ -59,8 +66,9 @@ class Options:
     smooth: float = 0.5
     """Smooth the depth of a mesh: standard deviation of a Gaussian, pixels."""
     bsdf: str = "diffuse:0.5,0.5,0.5"
-    """"diffuse:R,G,B"; a table of the MERL database, .binary; lobes and weights of a `ggx_dictionary`, .json; or the
-    name of one of its materials."""
+    """"diffuse:R,G,B"; "glaze:R,G,B", that colour under a clear coat; a table of the MERL database, .binary; lobes and
+    weights of a `ggx_dictionary`, .json; or the name of one of its materials. Several with | between them: regions of
+    equal areas, which differ from seed to seed."""
     lights: int = 96
     """How many."""
     spread: float = 55.0
@@ -112,11 +120,15 @@ class HeightField:
     depth: np.ndarray
     normals: np.ndarray
 
-    def mesh(self, bsdf: mi.BSDF, offset: np.ndarray) -> mi.Mesh:
+    def mesh(self, bsdf: mi.BSDF, offset: np.ndarray, attributes: dict[str, np.ndarray] | None = None) -> mi.Mesh:
+        """attributes : of the vertices, (D N, D N) each."""
         inside = np.isfinite(self.depth)
         vertices, faces, _ = mesh_of(self.depth, inside, pixel_size=1 / DETAIL)
         middle = (self.depth.shape[0] - 1) / 2 / DETAIL
-        return make_mesh(vertices + np.array([-middle, middle, 0]) + offset, faces, self.normals[inside], bsdf)
+        mesh = make_mesh(vertices + np.array([-middle, middle, 0]) + offset, faces, self.normals[inside], bsdf)
+        for name, values in (attributes or {}).items():
+            mesh.add_attribute(name, 1, values[inside].astype(np.float32))
+        return mesh
 
 
 def simulate(options: Options, *, progress: bool = True) -> tuple[Dataset, np.ndarray]:
@@ -139,7 +151,8 @@ def simulate(options: Options, *, progress: bool = True) -> tuple[Dataset, np.nd
     if options.focal:
         f = options.focal * N
         camera, origin = np.array([[f, 0, middle], [0, f, middle], [0, 0, 1]]), np.array([0, 0, -f])
-    mesh = height_field(options).mesh(bsdf(options.bsdf), origin)
+    surface = height_field(options)
+    mesh = surface.mesh(*_materials(options, origin, np.isfinite(surface.depth)))
     directions = spiral(options.lights, options.spread)
     lights, intensities = directions, np.ones((options.lights, 3))
     if options.led_distance:
@@ -188,7 +201,7 @@ def spiral(count: int, spread: float) -> np.ndarray:
 
 
 def height_field(options: Options) -> HeightField:
-    """The surface, and its normals as far as formulas tell them; of a mesh, they are those of its depth.
+    """The surface, and its normals as far as formulas tell them; of a mesh and of folds, they are those of its depth.
 
     Raises
     ------
@@ -203,6 +216,8 @@ def height_field(options: Options) -> HeightField:
     elif options.shape == "bowl":
         field = _sphere(x, y, a, 2 * a * options.hollow)
         field = _mirrored(field)
+    elif options.shape == "folds":
+        field = _folds(x, y, a, np.random.default_rng(options.seed))
     else:
         field = _of_mesh(x, y, 2 * a, options)
     return _mirrored(field) if options.concave else field
@@ -216,6 +231,20 @@ def _sphere(x: np.ndarray, y: np.ndarray, width: float, height: float) -> Height
     return HeightField(np.where(inside, R * n[..., 2] - (R - height), np.nan), n)
 
 
+def _folds(x: np.ndarray, y: np.ndarray, width: float, rng: np.random.Generator) -> HeightField:
+    """A dome with folds, as of a cloth: waves that bend. width : radius of its border."""
+    u, v = x / width, y / width
+    turn, first, second, bend = rng.uniform(0, 2 * np.pi, 4)
+    u, v = u * np.cos(turn) + v * np.sin(turn), v * np.cos(turn) - u * np.sin(turn)
+    u = u + 0.15 * np.sin(2.3 * v + bend)
+    waves = 0.09 * np.cos(4 * np.pi * u + first) + 0.04 * np.cos(2 * np.pi * (1.1 * u + 1.7 * v) + second)
+    inside = x**2 + y**2 < width**2
+    dome = 0.7 * np.sqrt(np.maximum(1 - 0.8 * (x**2 + y**2) / width**2, 0))
+    depth = np.where(inside, width * (dome + waves), np.nan)
+    depth -= np.nanmean(depth)
+    return HeightField(depth, normals_of(depth, inside, pixel_size=1 / DETAIL))
+
+
 def _mirrored(field: HeightField) -> HeightField:
     return HeightField(-field.depth, field.normals * [-1, -1, 1])
 
@@ -224,7 +253,7 @@ def _of_mesh(x: np.ndarray, y: np.ndarray, size: float, options: Options) -> Hei
     """What the camera sees of a mesh: the highest point at each place."""
     path = Path(options.shape)
     if path.suffix.lower() not in (".obj", ".ply"):
-        raise ValueError(f'ps: unknown shape "{path}", expected sphere, bowl, or a file .obj or .ply')
+        raise ValueError(f'ps: unknown shape "{path}", expected sphere, bowl, folds, or a file .obj or .ply')
     if not path.is_file():
         raise FileNotFoundError(f'ps: there is no file "{path}"')
     mesh = _load({"type": path.suffix[1:].lower(), "filename": str(path), "face_normals": True})
@@ -267,21 +296,39 @@ def _rotation(degrees: tuple[float, float, float]) -> np.ndarray:
 # ---------------------- Rendering ----------------------
 
 
+def _materials(options: Options, origin: np.ndarray, inside: np.ndarray) -> tuple[mi.BSDF, np.ndarray, dict]:
+    """What `HeightField.mesh` needs: the BSDF, blended from several by attributes of the vertices, and these.
+
+    inside : (D N, D N), bool, where the surface is.
+    """
+    found, *others = (bsdf(text) for text in options.bsdf.split("|"))
+    rng, attributes = np.random.default_rng([options.seed, 1]), {}
+    noise = ndimage.gaussian_filter(rng.standard_normal(inside.shape), REGION * len(inside))
+    borders = np.quantile(noise[inside], np.arange(1, len(others) + 1) / (len(others) + 1))
+    for k, (other, border) in enumerate(zip(others, borders, strict=True)):
+        attributes[f"vertex_region{k}"] = noise > border
+        weight = {"type": "mesh_attribute", "name": f"vertex_region{k}"}
+        found = mi.load_dict({"type": "blendbsdf", "weight": weight, "first": found, "second": other})
+    return found, origin, attributes
+
+
 def bsdf(text: str) -> mi.BSDF:
-    """What `Options.bsdf` means.
+    """What a part of `Options.bsdf` means.
 
     Raises
     ------
     ValueError : it means nothing, or the file cannot be read. FileNotFoundError.
     """
     kind, colon, rest = text.partition(":")
-    if colon and kind == "diffuse":
+    if colon and kind in ("diffuse", "glaze"):
         try:
             colour = [float(c) for c in rest.split(",")]
         except ValueError:
             colour = []
         if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
-            raise ValueError(f'ps: expected "diffuse:R,G,B", from 0 to 1, got "{text}"')
+            raise ValueError(f'ps: expected "{kind}:R,G,B", from 0 to 1, got "{text}"')
+        if kind == "glaze":
+            return _glaze(colour)
         return mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}})
     plugin = {".binary": "merl", ".json": "ggx_dictionary"}.get(Path(text).suffix.lower())
     if plugin is None:
@@ -294,6 +341,20 @@ def bsdf(text: str) -> mi.BSDF:
     if not Path(text).is_file():
         raise FileNotFoundError(f'ps: there is no file "{text}"')
     return _load({"type": plugin, "filename": text})
+
+
+def _glaze(colour: list[float]) -> mi.BSDF:
+    alpha, eta = GLAZE
+    return mi.load_dict(
+        {
+            "type": "ggx_dictionary",
+            "alpha": mi.Float(alpha),
+            "eta": mi.Float(eta),
+            "weights": mi.TensorXf([1.0], shape=(1, 1)),
+            "base": {"type": "rgb", "value": colour},
+            "base_eta": eta,
+        }
+    )
 
 
 def _load(description: dict) -> mi.Object:

@@ -21,6 +21,9 @@ SAMPLED_ALPHAS = 5
 #: derivative, too.
 EVEN = 0.1
 
+#: What the base is taken to reflect, when lobes are chosen: only the number of samples depends on it.
+BASE = 0.5
+
 
 class GGXDictionaryBSDF(mi.BSDF):
     r"""
@@ -57,6 +60,16 @@ class GGXDictionaryBSDF(mi.BSDF):
        - Grey factor of all lobes, such as a ``mesh_attribute`` of one channel. Not negative; the surface reflects no
          more than it receives if it is at most 1 over the largest sum of weights. (Default: 1)
        - |exposed|, |differentiable|
+
+     * - base
+       - |spectrum| or |texture|
+       - Of a diffuse lobe more, the colour, to which `scale` does not apply: what lies under a glaze, and varies
+         where the glaze does not. Such as a ``mesh_attribute`` of three channels. (Default: none)
+       - |exposed|, |differentiable|
+
+     * - base_eta
+       - |float|
+       - The index of refraction of the smooth coat over it. (Default: none, it is Lambertian)
 
     The reflectance model of *Towards Shape Reconstruction through Differentiable Rendering* (Bangaru 2019, chapter 3):
     a combination of B fixed lobes, in which only the weights :math:`\theta` are unknown,
@@ -103,9 +116,9 @@ class GGXDictionaryBSDF(mi.BSDF):
 
     **Colour.** Monochromatic variants see the luminance, and hold it as the parameter, of shape (B, 1).
 
-    **Limits.** The back of a surface is black: put this into a ``twosided``. Nothing is transmitted. But for `scale`, a
-    surface is the same everywhere. Spectral and polarised variants are refused. Sums of weights may exceed 1 by
-    0.00001, since files round them.
+    **Limits.** The back of a surface is black: put this into a ``twosided``. Nothing is transmitted. But for `scale`
+    and `base`, a surface is the same everywhere. Spectral and polarised variants are refused. Sums of weights may
+    exceed 1 by 0.00001, since files round them; and with a `base`, a surface may reflect more than it receives.
 
     .. tabs::
         .. code-tab:: xml
@@ -139,6 +152,10 @@ class GGXDictionaryBSDF(mi.BSDF):
         if isinstance(scale, int | float) and not scale >= 0:
             raise ValueError(f'{who}: "scale" must be >= 0, got {scale}')
         self.scale = props.get_texture("scale") if "scale" in props else None
+        self.base = props.get_texture("base") if "base" in props else None
+        self._base_eta = props.get("base_eta", float("nan"))
+        if not (np.isnan(self._base_eta) or self._base_eta > 1):
+            raise ValueError(f'{who}: "base_eta" must be > 1, got {self._base_eta}')
         # In Dr.Jit's own memory: `dr.freeze` does not go with NumPy's
         self.weights = mi.TensorXf(mi.Float(weights.ravel().tolist()), shape=weights.shape)
         self._alphas, nearest = _few_alphas(self.lobes)
@@ -147,7 +164,7 @@ class GGXDictionaryBSDF(mi.BSDF):
         self._normal_reflectance = mi.Float(self.lobes.normal_reflectance.tolist())
         flags = mi.BSDFFlags
         both = flags.FrontSide
-        if self.scale is not None and self.scale.is_spatially_varying():
+        if any(texture is not None and texture.is_spatially_varying() for texture in (self.scale, self.base)):
             both |= flags.SpatiallyVarying
         self.m_components = [flags.GlossyReflection | both, flags.DiffuseReflection | both]
         self.m_flags = self.m_components[GLOSSY] | self.m_components[DIFFUSE]
@@ -159,6 +176,8 @@ class GGXDictionaryBSDF(mi.BSDF):
         cb.put("weights", self.weights, mi.ParamFlags.Differentiable)
         if self.scale is not None:
             cb.put("scale", self.scale, mi.ParamFlags.Differentiable)
+        if self.base is not None:
+            cb.put("base", self.base, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         shape = len(self.lobes), dr.size_v(mi.UnpolarizedSpectrum)
@@ -172,6 +191,9 @@ class GGXDictionaryBSDF(mi.BSDF):
             self._shares = dr.zeros(mi.Float, 2 * count)
             dr.scatter_add(self._shares, grey * self._normal_reflectance, self._entry)
             dr.scatter_add(self._shares, grey, self._entry + count)
+            if self.base is not None:
+                last = mi.UInt32(count - 1, 2 * count - 1)
+                dr.scatter_add(self._shares, mi.Float(BASE), last)
         dr.make_opaque(self.weights, self._shares)
 
     def to_string(self) -> str:
@@ -213,8 +235,11 @@ class GGXDictionaryBSDF(mi.BSDF):
         for alpha, factor, members in ggx.terms(self.lobes, si.wi, wo):
             if diffuse if np.isnan(alpha) else glossy:
                 result += factor * sum(weight(i) * F for i, F in members)
-        cos = wo.z if self.scale is None else wo.z * self.scale.eval_1(si, active)
-        return dr.select(active & (si.wi.z > 0) & (wo.z > 0), result * cos, 0)
+        if self.scale is not None:
+            result *= self.scale.eval_1(si, active)
+        if self.base is not None and diffuse:
+            result += self.base.eval(si, active) * ggx.diffuse(self._base_eta, si.wi.z, wo.z)
+        return dr.select(active & (si.wi.z > 0) & (wo.z > 0), result * wo.z, 0)
 
     def pdf(self, ctx, si, wo, active=True):
         wi, wo = dr.detach(si.wi), dr.detach(wo)
@@ -234,6 +259,8 @@ class GGXDictionaryBSDF(mi.BSDF):
             result += dr.gather(mi.UnpolarizedSpectrum, self.weights.array, dr.full(mi.UInt32, i, dr.width(si.wi)))
         if self.scale is not None:
             result *= self.scale.eval_1(si, active)
+        if self.base is not None:
+            result += self.base.eval(si, active)
         return dr.select(active, result, 0)
 
     def _probabilities(self, ctx: mi.BSDFContext, wi: mi.Vector3f) -> dict[int, mi.Float]:

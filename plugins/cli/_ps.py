@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -67,10 +71,13 @@ class Run:
             nonlocal found
             found = output.snapshot(result)
             output.write_numbers(self.out, found, self.options, status="running", truth=truth)
+            if stopped:
+                raise KeyboardInterrupt
 
         status = "finished"
         try:
-            reconstruction.reconstruct(data, self.options, progress=sys.stderr.isatty(), after=after)
+            with _listening() as stopped:
+                found = reconstruction.reconstruct(data, self.options, progress=sys.stderr.isatty(), after=after)
         except KeyboardInterrupt:
             if found is None:
                 raise
@@ -147,6 +154,26 @@ class Ps:
 
     def run(self) -> int:
         return self.command.run()
+
+
+@contextmanager
+def _listening() -> Iterator[list[bool]]:
+    """Within it, Ctrl-C only adds to the list that it gives, for the end of the alternation: in the midst of one, it
+    may leave Dr.Jit in the midst of a loop. Pressed again, it interrupts at once."""
+    pressed: list[bool] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed
+        return
+
+    def press(*_) -> None:
+        pressed.append(True)
+        signal.signal(signal.SIGINT, previous)
+
+    previous = signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 def _true_depth(folder: Path) -> np.ndarray | None:

@@ -14,9 +14,11 @@ from photometric import LAMBERT, UP, disc, glossy
 from rimlight import ggx
 from rimlight.checks import mean_and_error
 from rimlight.inverse.photometric_stereo import reconstruction, refinement
+from rimlight.inverse.photometric_stereo.alternation import State
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
 from rimlight.inverse.photometric_stereo.descent import ExponentiatedGradient, NormalAdam
 from rimlight.inverse.photometric_stereo.direct import DirectModel, Guess, simplex_least_squares
+from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering
 from rimlight.inverse.photometric_stereo.simulation import spiral
 from rimlight.leds import Led
@@ -232,7 +234,7 @@ def test_bsdf_is_found_while_normals_follow(plastic: Scene) -> None:
 
 @pytest.mark.parametrize("coat", [True, False])
 def test_coat_needs_evidence(plastic: Scene, coat: bool) -> None:
-    """It is taken where light is diffuse under a coat, not for the normals of the start."""
+    """It is taken where light is diffuse under a coat: if it then predicts better what was left out."""
     lobes = plastic.rendering.lobes
     coated = np.isnan(lobes.alpha) & ~np.isnan(lobes.eta)
     truth = deepcopy(plastic.guess)
@@ -240,16 +242,96 @@ def test_coat_needs_evidence(plastic: Scene, coat: bool) -> None:
         truth.weights[np.isnan(lobes.eta)] = 0
         truth.weights[coated] = (0.5, 0.35, 0.2)
     values = plastic.model().predicted(truth).astype(np.float32)
-    model = plastic._replace(data=dataclasses.replace(plastic.data, values=values)).model()
-    guess, rng = deepcopy(truth), np.random.default_rng(0)
-    guess.weights = glossy(lobes)
-    guess.normals = leaning(guess.normals)
-    for i in range(8):
-        model.fit_bsdf(guess, rng, coat=None if i >= 3 else False)
-        model.fit_normals(guess)
-    found = guess.weights[coated].sum(0)
-    assert (found > 0.15).all() if coat else (found == 0).all()
-    assert angles(guess.normals, truth.normals).mean() < 0.3
+    values += np.float32(0.01 * np.median(values)) * np.random.default_rng(1).standard_normal(values.shape, np.float32)
+    data = dataclasses.replace(plastic.data, values=values)
+    model = plastic._replace(data=data).model()
+    states = []
+    for kind in (Kind(), Kind(coat=True)):
+        guess, rng = deepcopy(truth), np.random.default_rng(0)
+        guess.weights = glossy(lobes)
+        guess.normals = leaning(guess.normals)
+        for _ in range(4):
+            model.fit_bsdf(guess, rng, coat=kind.coat)
+            model.fit_normals(guess)
+        errors = judge_of(data, lobes).errors(guess, kind, *seen_by_all(data))
+        states.append(State(guess, plastic.depth, kind, errors.mean(), errors.std() / np.sqrt(len(errors))))
+    plain, with_coat = states
+    assert with_coat.needed_beside(plain) == coat
+    found = states[coat].guess
+    assert (found.weights[coated].sum(0) > 0.15).all() if coat else (found.weights[coated] == 0).all()
+    assert angles(found.normals, truth.normals).mean() < 0.3
+
+
+def judge_of(data: Dataset, lobes: ggx.Lobes) -> Judge:
+    return Judge(data, lobes, left_out(data, 0), np.ones(data.values.shape[:2], np.float32), 0, "trimmed")
+
+
+def seen_by_all(data: Dataset) -> tuple[np.ndarray, np.ndarray, None]:
+    """Points, and what they see, far from all lights."""
+    P, K, _ = data.values.shape
+    return np.zeros((P, 3)), np.ones((P, K), bool), None
+
+
+def glazed(plastic: Scene) -> tuple[Dataset, Guess]:
+    """A dark half and a light one, under one clear coat."""
+    lobes, truth = plastic.rendering.lobes, deepcopy(plastic.guess)
+    truth = Kind(several=True, coat=True).of(truth, lobes)
+    truth.weights[:] = 0
+    truth.weights[np.nanargmin(np.abs(np.array(lobes.alpha) - 0.2))] = 0.8
+    right = np.nonzero(plastic.data.mask)[1] > plastic.data.mask.shape[1] // 2
+    truth.base = np.where(right[:, None], [0.03, 0.04, 0.2], [0.7, 0.65, 0.6])
+    values = plastic.model().predicted(truth).astype(np.float32)
+    return dataclasses.replace(plastic.data, values=values), truth
+
+
+def test_colours_under_a_glaze(plastic: Scene) -> None:
+    """They are found with the normals and the glaze, none of which one material times a factor explains."""
+    data, truth = glazed(plastic)
+    model = plastic._replace(data=data).model()
+    rng, errors, predicted = np.random.default_rng(0), {}, {}
+    for kind in (Kind(), Kind(several=True, coat=True)):
+        guess = deepcopy(plastic.guess)
+        guess.normals, guess.weights = leaning(guess.normals), glossy(plastic.rendering.lobes)
+        guess = kind.of(guess, plastic.rendering.lobes)
+        for _ in range(8):
+            model.fit_bsdf(guess, rng, coat=kind.coat)
+            model.fit_normals(guess)
+        errors[kind.several] = angles(guess.normals, truth.normals).mean()
+        of_left = judge_of(data, plastic.rendering.lobes).errors(guess, kind, *seen_by_all(data))
+        predicted[kind.several] = of_left.mean()
+    print(errors, predicted, np.abs(guess.base - truth.base).mean())
+    assert errors[True] < 0.5 < errors[False]
+    assert predicted[True] < 0.2 * predicted[False]
+    np.testing.assert_allclose(guess.base, truth.base, atol=0.03)
+    rendered = Rendering(data, plastic.rendering.lobes, max_depth=2, several=True, base_eta=truth.base_eta)
+    rendered.update(truth, plastic.depth)
+    inside = np.abs(np.nonzero(data.mask)[1] - data.mask.shape[1] // 2 - 0.5) > 2  # the mesh blends the two colours
+    image, values = rendered.image(spp=64, seed=0)[inside], data.values[inside]
+    assert np.abs(image - values).mean() < 0.01 * values.mean()
+
+
+def test_what_is_left_out(plastic: Scene) -> None:
+    """Whole lights, and others of blocks; none of which the refit sees, so that wrong values there change no normal."""
+    left = left_out(plastic.data, 0)
+    K = left.shape[1]
+    share = left.mean(0)
+    assert (share == 1).sum() == max(round(0.1 * K), 1)
+    assert ((share > 0) & (share < 1)).any()
+    assert 0.1 < left.mean() < 0.35
+    np.testing.assert_array_equal(left, left_out(plastic.data, 0))
+    assert (left != left_out(plastic.data, 1)).any()
+    few = dataclasses.replace(
+        plastic.data, values=plastic.data.values[:, :6], lights=plastic.data.lights[:6], intensities=np.ones((6, 3))
+    )
+    assert not left_out(few, 0).any()
+    judge = judge_of(plastic.data, plastic.rendering.lobes)
+    right = judge.errors(plastic.guess, Kind(), *seen_by_all(plastic.data))
+    values = plastic.data.values.copy()
+    values[left] *= 1.2
+    wrong = dataclasses.replace(judge, data=dataclasses.replace(plastic.data, values=values))
+    found = wrong.errors(plastic.guess, Kind(), *seen_by_all(plastic.data))
+    assert right.mean() < 0.01
+    assert found.mean() == pytest.approx(0.2, rel=0.35)
 
 
 def test_lighting() -> None:

@@ -55,7 +55,8 @@ def result(folder, tmp_path_factory) -> tuple[Path, str]:
     lines: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_ps, "print", lambda *words, **_: lines.append(" ".join(words)), raising=False)
-        assert main(["ps", "run", str(folder), "--out", str(out), *QUICK, "--brightness", "0"]) == 0
+        one = ["--materials", "one", "--coat", "False"]
+        assert main(["ps", "run", str(folder), "--out", str(out), *QUICK, *one, "--brightness", "0"]) == 0
     return out, lines[-1]
 
 

@@ -278,6 +278,33 @@ def test_samples_have_their_density(lobes, angle, component):
     assert test.run(test_count=5, quiet=True), test.messages
 
 
+BASE = {"base": {"type": "rgb", "value": [0.1, 0.4, 0.7]}}
+
+
+@pytest.mark.parametrize("eta", [NAN, 1.5])
+def test_a_base_is_a_diffuse_lobe_that_the_scale_leaves_alone(eta):
+    weights, (wi, wo) = random_weights(), random_directions()
+    coat = {} if np.isnan(eta) else {"base_eta": eta}
+    bsdf = mi.load_dict({**material(weights), **BASE, **coat, "scale": 0.3})
+    lobe = mi.load_dict(material([BASE["base"]["value"]], ggx.Lobes((NAN,), (eta,))))
+    rest = mi.load_dict({**material(weights), "scale": 0.3})
+    values = lambda b: np.array(b.eval(context(), interaction(wi), vector(wo)))
+    np.testing.assert_allclose(values(bsdf), values(lobe) + values(rest), rtol=1e-5)
+    glossy = np.array(bsdf.eval(context(GLOSSY), interaction(wi), vector(wo)))
+    np.testing.assert_allclose(glossy, rest.eval(context(GLOSSY), interaction(wi), vector(wo)), rtol=1e-6)
+
+
+def test_samples_of_a_base_have_their_density():
+    bsdf = mi.load_dict({**material(random_weights(ROUGH) * ~np.isnan(ROUGH.alpha)[:, None], ROUGH), **BASE})
+    test = chi_squared(bsdf, 45.0)
+    assert test.run(test_count=5, quiet=True), test.messages
+
+
+def test_a_base_under_an_impossible_coat_is_refused():
+    with pytest.raises(RuntimeError, match=r'"base_eta" must be > 1, got 0\.9'):
+        mi.load_dict({**material(random_weights()), **BASE, "base_eta": 0.9})
+
+
 def test_the_wrong_density_is_noticed():
     weights = random_weights(ROUGH)
     glossy = weights * ~np.isnan(ROUGH.alpha)[:, None]

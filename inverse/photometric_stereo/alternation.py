@@ -1,0 +1,186 @@
+"""Alternations at one size of the images, for one kind of material: what `reconstruction.reconstruct` is made of."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import ndimage
+
+from rimlight import ggx
+
+from . import calibration
+from .dataset import LUMINANCE, Dataset, angles
+from .direct import DirectModel, Guess
+from .evidence import Judge, Kind
+from .rendering import Rendering
+
+#: Share of the newest interreflections in their running mean.
+AVERAGED = 0.25
+
+#: Exposures that seem to be off by less (logarithm) are taken as stated: shapes and BSDFs explain so much as well.
+STATED = 0.02
+
+#: Fits of the BSDF and of normals in turns, in each alternation: rendering takes longer.
+INNER = 3
+
+#: Alternations end after so many that predict what was left out worse than the best one did.
+PATIENCE = 3
+
+
+@dataclass
+class State:
+    """guess, and depth, (Q,), with the kind of its material. left_out : how far the values that were left out are off
+    what is predicted, in the mean value of each pixel; NaN if there are too few lights. uncertain : its standard error.
+    start : is it the start?"""
+
+    guess: Guess
+    depth: np.ndarray
+    kind: Kind
+    left_out: float = np.nan
+    uncertain: float = 0.0
+    start: bool = False
+
+    def better_than(self, other: State | None) -> bool:
+        """Where nothing can be left out, what is newer is."""
+        return other is None or not self.left_out >= other.left_out
+
+    def needed_beside(self, simpler: State) -> bool:
+        """Does it predict better by more than the standard error of what is simpler? (The rule of one standard error,
+        Breiman et al. 1984, section 3.4.3.)"""
+        return self.left_out < simpler.left_out - simpler.uncertain
+
+
+@dataclass
+class View:
+    """What a state shows: points, (P, 3); which lights its surface does not hide, (P, K); and what it reflects on
+    itself, (P, K, 3), or None."""
+
+    points: np.ndarray
+    seen: np.ndarray
+    indirect: np.ndarray | None
+
+
+@dataclass
+class Alternations:
+    """Of one kind of material.
+
+    options : `reconstruction.Options`. counts : (P, K), how much values count.
+    """
+
+    data: Dataset
+    lobes: ggx.Lobes
+    kind: Kind
+    judge: Judge
+    options: object
+    rng: np.random.Generator
+    rendering: Rendering = field(init=False)
+
+    def __post_init__(self):
+        eta = self.kind.base_eta(self.lobes)
+        several = self.kind.several
+        self.rendering = Rendering(
+            self.data, self.lobes, max_depth=self.options.max_depth, several=several, base_eta=eta
+        )
+        self.flat = DirectModel(self.data, self.lobes)
+
+    @property
+    def domain(self):
+        return self.rendering.domain
+
+    def integrate(self, guess: Guess) -> np.ndarray:
+        return self.domain.integrate(guess.normals, self.options.bilateral)
+
+    def view(self, guess: Guess, depth: np.ndarray, before: np.ndarray | None = None, number: int = 0) -> View:
+        """Path trace a state. before : interreflections of `number` states before, of which a mean is made, in place:
+        less noise, and as the surface hardly changes, hardly older."""
+        options = self.options
+        self.rendering.update(guess, depth)
+        indirect = None
+        if options.max_depth > 2:
+            indirect = self.rendering.indirect(spp=options.spp, seed=int(self.rng.integers(2**31)))
+            _smooth(indirect, self.data.mask, options.smoothing)
+            if before is not None:
+                indirect -= before
+                indirect *= max(1 / (number + 1), AVERAGED)
+                before += indirect
+                indirect = before
+        seen = self.rendering.visible(self.flat) if options.shadows else np.ones(self.judge.counts.shape, bool)
+        return View(self.domain.points(depth), seen, indirect)
+
+    def score(self, state: State, view: View) -> None:
+        if self.judge.able:
+            errors = self.judge.errors(state.guess, self.kind, view.points, view.seen, view.indirect)
+            state.left_out, state.uncertain = float(errors.mean()), float(errors.std() / np.sqrt(len(errors)))
+
+    def run(self, start: State, most: int, record: Callable[[State, float], None], seen: View | None = None) -> State:
+        """The best of the states that at most so many alternations make, and of the first.
+
+        record : is called with each new one and its residual. seen : the view of the first, if it is known.
+        """
+        state, best, view, worse = start, None, None, 0
+        state.guess = self.kind.of(state.guess, self.lobes)
+        for i in range(most + 1):
+            if seen is None:
+                seen = self.view(state.guess, state.depth, None if view is None else view.indirect, i)
+            view, seen = seen, None
+            if not (state.start and i == 0 and np.isfinite(state.left_out)):
+                self.score(state, view)
+            worse = 0 if state.better_than(best) else worse + 1
+            if not worse:
+                best = copy.deepcopy(state)
+            if i == most or worse == PATIENCE:
+                break
+            before = state.guess.normals
+            state = State(copy.deepcopy(state.guess), state.depth, self.kind)
+            residual = self.fit(state.guess, view)
+            state.depth = self.integrate(state.guess)
+            record(state, residual)
+            if angles(before, state.guess.normals).mean() < self.options.tolerance:
+                most = i + 1
+        return best
+
+    def fit(self, guess: Guess, view: View) -> float:
+        """One alternation, in place: BSDF, normals, exposures. Returns the relative residual."""
+        counts = self.judge.counts * view.seen
+        model = DirectModel(self.data, self.lobes, points=view.points, counts=counts, indirect=view.indirect)
+        for _ in range(INNER):
+            model.fit_bsdf(guess, self.rng, coat=self.kind.coat)
+            model.fit_normals(guess, steps=2, free_albedo=self.options.albedo)
+        if self.options.albedo and guess.base is None:
+            guess.albedo /= np.median(guess.albedo)
+        pixels = self.rng.choice(model.P, min(2000, model.P), replace=False)
+        predicted, w = model.predicted(guess, pixels), counts[pixels]
+        residual = (w[..., None] * (predicted - self.data.values[pixels]) ** 2).sum() / max(w.sum(), 1e-9) / 3
+        if self.options.exposures:
+            guess.exposures *= calibration.exposures(
+                self.data.luminance[pixels], predicted @ LUMINANCE, w, model.mean_directions()
+            )
+            guess.exposures[np.abs(np.log(guess.exposures)) < STATED] = 1
+        return float(np.sqrt(residual) / model.scale)
+
+    def judged_start(self, guess: Guess, lights: np.ndarray, kinds: tuple[Kind, ...]) -> tuple[State, View | None]:
+        """The start, with its normals held, as its best material of these kinds predicts what was left out; and its
+        view, if anything was."""
+        depth = self.integrate(guess)
+        state, view = State(guess, depth, Kind(), start=True), None
+        if self.judge.able:
+            view = self.view(self.kind.of(guess, self.lobes), depth)
+            of_view = view.points, view.seen, view.indirect
+            state.left_out = min(
+                float(self.judge.errors(guess, kind, *of_view, lights=lights).mean()) for kind in kinds
+            )
+        return state, view
+
+
+def _smooth(pixels: np.ndarray, mask: np.ndarray, width: float) -> None:
+    """Gaussian means over the pixels of the mask, of each image of (P, K, 3), in place."""
+    if not width:
+        return
+    share = ndimage.gaussian_filter(mask.astype(np.float32), width)[mask]
+    image = np.zeros((*mask.shape, 3), np.float32)
+    for k in range(pixels.shape[1]):
+        image[mask] = pixels[:, k]
+        pixels[:, k] = ndimage.gaussian_filter(image, (width, width, 0))[mask] / share[:, None]

@@ -1,0 +1,235 @@
+"""Photometric stereo of what is hard: results are never worse than their start; data that tell nothing are refused, and
+those that tell less than they seem to are reported."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from rimlight.cli import main
+from rimlight.exr import read_exr, replacing
+from rimlight.inverse import photometric_stereo as ps
+from rimlight.inverse.photometric_stereo import alternation, dataset, least_squares, output, report, simulation
+from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.evidence import Kind
+from rimlight.inverse.photometric_stereo.rendering import Rendering
+
+N = 24
+QUICK = {"resolutions": (1.0,), "iterations": (2,), "max_depth": 2, "brightness": 0.0}
+
+
+def simulated(**options) -> Dataset:
+    given = {"size": N, "lights": 12, "spp": 16, "max_depth": 2, **options}
+    return simulation.simulate(simulation.Options(**given), progress=False)[0]
+
+
+@pytest.fixture(scope="module")
+def matte() -> Dataset:
+    return simulated(noise=0.01)
+
+
+def of_lights(data: Dataset, chosen: list[int]) -> Dataset:
+    few = {"values": data.values[:, chosen], "lights": data.lights[chosen], "intensities": data.intensities[chosen]}
+    return dataclasses.replace(data, **few)
+
+
+# ------------------------------------------------------------------ the guard
+
+
+def test_a_ruined_state_is_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alternations that turn normals away from what the images show: the start is returned, and the result says so."""
+    fit = alternation.Alternations.fit
+
+    def ruined(self, guess, view):
+        residual = fit(self, guess, view)
+        guess.normals = unit(guess.normals + np.array([0.5, 0, 0]))
+        return residual
+
+    score = alternation.Alternations.score
+
+    def without_refit(self, state, view):
+        """As if nothing brought the normals back."""
+        with monkeypatch.context() as patch:
+            patch.setattr("rimlight.inverse.photometric_stereo.evidence.REFITS", 0)
+            score(self, state, view)
+
+    monkeypatch.setattr(alternation.Alternations, "fit", ruined)
+    monkeypatch.setattr(alternation.Alternations, "score", without_refit)
+    found = ps.reconstruct(matte, ps.Options(**QUICK, reflectance=False), progress=False)
+    assert found.history[-1]["error"] > 10
+    assert found.verdict == "start"
+    np.testing.assert_allclose(found.guess.normals, found.start, atol=1e-9)
+    assert found.left_out["start"] <= found.left_out["result"]
+
+
+def test_the_best_state_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not the last one."""
+    scores = iter([3.0, 1.0, 2.0, 2.5])
+
+    def score(self, state, view):
+        state.left_out = next(scores)
+
+    states = []
+    monkeypatch.setattr(alternation.Alternations, "score", score)
+    monkeypatch.setattr(alternation.Alternations, "judged_start", lambda self, guess, *_: (alternation.State(
+        guess, self.integrate(guess), self.kind, 4.0, start=True), None))  # fmt: skip
+    options = ps.Options(**{**QUICK, "iterations": (4,), "tolerance": 0.0}, reflectance=False)
+    found = ps.reconstruct(matte, options, progress=False, after=lambda r: states.append(r.guess.normals.copy()))
+    assert len(states) == 4
+    np.testing.assert_array_equal(found.guess.normals, states[1])
+    assert found.verdict == "judged"
+    assert found.left_out == {"start": 4.0, "result": 1.0}
+
+
+def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
+    """Of several materials, in the unit of the images."""
+    options = ps.Options(**QUICK, reflectance=False)
+    found = ps.reconstruct(matte, options, progress=False)
+    found.guess = Kind(several=True).of(found.guess, found.lobes)
+    output.write_numbers(tmp_path, found, options, status="finished")
+    base = read_exr(tmp_path / "base.exr")[0][""]
+    np.testing.assert_allclose(base[matte.mask], found.guess.base, rtol=1e-6)
+    assert base[matte.mask].mean() == pytest.approx(0.5, rel=0.05)
+    assert json.loads((tmp_path / "metadata.json").read_text("utf-8"))["materials"] == "several"
+    report.write(tmp_path, found, options, title="colours", status="finished")
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert "Diffuse colours" in text and "values that were left out are predicted" in text
+
+
+def test_maps_of_a_result(matte: Dataset) -> None:
+    found = ps.reconstruct(matte, ps.Options(**QUICK, reflectance=False), progress=False)
+    np.testing.assert_array_equal(found.normal_map[matte.mask], found.guess.normals)
+    assert (found.normal_map[~matte.mask] == 0).all()
+    assert found.depth_map.shape == matte.mask.shape
+    np.testing.assert_array_equal(np.isfinite(found.depth_map), matte.mask)
+
+
+# ------------------------------------------------------------------ several materials
+
+
+def test_regions_of_materials() -> None:
+    """As large as each other, another for each seed, each with its own colour, under one glaze."""
+    colours = "glaze:0.05,0.05,0.4|glaze:0.7,0.7,0.7"
+    first, again, other = (simulated(shape="folds", bsdf=colours, seed=s, spp=4) for s in (3, 3, 4))
+    np.testing.assert_array_equal(first.mask, again.mask)
+    np.testing.assert_allclose(first.values, again.values, rtol=1e-5)
+    assert first.values.shape != other.values.shape or np.abs(first.values - other.values).mean() > 0.01
+    b = [least_squares.trimmed(first.values[..., c], first.lights) for c in (0, 2)]
+    red, blue = (np.linalg.norm(x, axis=1) for x in b)
+    assert 0.35 < (blue > 2 * red).mean() < 0.65
+
+
+# ------------------------------------------------------------------ few lights
+
+
+@pytest.mark.parametrize("method", ["trimmed", "least squares"])
+def test_three_lights(matte: Dataset, method: str) -> None:
+    """Trimming would leave one value of each pixel."""
+    few = of_lights(matte, [3, 4, 5])
+    lit = (few.values > 0).all((1, 2))
+    found = least_squares.normals(few.luminance, few.lights, method)
+    assert angles(found, matte.truth)[lit].mean() < 2
+
+
+def test_darkest_values_of_few_lights() -> None:
+    values = np.random.default_rng(0).uniform(size=(20, 40))
+    for K, kept in ((3, 3), (4, 4), (5, 4), (10, 8), (40, 32)):
+        assert (least_squares.brightest(values[:, :K], 0.2).sum(1) == kept).all()
+
+
+@pytest.mark.parametrize("how", ["equal", "in a plane"])
+def test_lights_that_do_not_tell_normals(matte: Dataset, how: str) -> None:
+    lights = np.tile(matte.lights[3], (12, 1)) if how == "equal" else unit(matte.lights * [1, 0, 1])
+    with pytest.raises(ValueError, match="all equal, or lie in a plane"):
+        ps.reconstruct(dataclasses.replace(matte, lights=lights), ps.Options(**QUICK), progress=False)
+
+
+# ------------------------------------------------------------------ images
+
+
+def test_black_images(matte: Dataset) -> None:
+    black = dataclasses.replace(matte, values=np.zeros_like(matte.values))
+    with pytest.raises(ValueError, match="all images are black"):
+        ps.reconstruct(black, ps.Options(**QUICK), progress=False)
+
+
+def test_a_mask_of_one_pixel(matte: Dataset) -> None:
+    mask = np.zeros_like(matte.mask)
+    mask[N // 2, N // 2] = True
+    one = dataclasses.replace(matte, mask=mask, values=matte.values[:1], truth=matte.truth[:1])
+    with pytest.raises(ValueError, match="1 pixels, at least 9"):
+        ps.reconstruct(one, ps.Options(**QUICK), progress=False)
+
+
+def test_clipped_images_are_reported_and_do_not_count(matte: Dataset, caplog: pytest.LogCaptureFixture) -> None:
+    """At half of their maximum."""
+    assert not matte.clipped.any()
+    most = 0.5 * matte.values.max()
+    data = dataclasses.replace(matte, values=np.minimum(matte.values, most))
+    assert (data.clipped == (data.values >= most).any(2)).mean() > 0.999
+    found = ps.reconstruct(data, ps.Options(**QUICK, reflectance=False), progress=False)
+    assert "are clipped" in caplog.text
+    whole = ps.reconstruct(matte, ps.Options(**QUICK, reflectance=False), progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Dataset, "clipped", property(lambda self: np.zeros(self.values.shape[:2], bool)))
+        counted = ps.reconstruct(data, ps.Options(**QUICK, reflectance=False), progress=False)
+    print(whole.error, found.error, counted.error)
+    assert found.error < 0.6 * counted.error
+
+
+@pytest.mark.parametrize(("kind", "reported"), [("sRGB", True), ("linear", False)])
+def test_pictures_of_8_bits_encoded_as_srgb(matte: Dataset, tmp_path, caplog, kind: str, reported: bool) -> None:
+    folder = tmp_path / "data"
+    simulation.dataset.write(folder, matte)
+    names = []
+    for k in range(12):
+        linear = np.clip(matte.image(matte.values[:, k]) / matte.values.max(), 0, 1)
+        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        picture = np.round(255 * (srgb if kind == "sRGB" else linear)).astype(np.uint8)
+        names.append(f"{k + 1:03d}.png")
+        Image.fromarray(picture).save(folder / names[-1])
+    (folder / "filenames.txt").write_text("\n".join(names))
+    dataset.read(folder)
+    assert ("look as if they were encoded as sRGB" in caplog.text) == reported
+
+
+# ------------------------------------------------------------------ interruption, disk
+
+
+def test_ctrl_c_waits_for_the_end_of_an_alternation(matte: Dataset, tmp_path, monkeypatch) -> None:
+    """And then writes all that was found."""
+    dataset.write(tmp_path / "data", matte)
+    visible, calls = Rendering.visible, []
+
+    def pressed(self, model):
+        calls.append(model)
+        if len(calls) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return visible(self, model)
+
+    monkeypatch.setattr(Rendering, "visible", pressed)
+    out = tmp_path / "out"
+    options = ["--resolutions", "1", "--iterations", "5", "--max-depth", "2", "--no-reflectance"]
+    assert main(["ps", "run", str(tmp_path / "data"), "--out", str(out), *options]) == 130
+    assert len(calls) == 1
+    metadata = json.loads((out / "metadata.json").read_text("utf-8"))
+    assert metadata["status"] == "interrupted"
+    assert len(metadata["history"]) == 1
+    assert {"report.html", "mesh.ply", "normals.exr"} <= {path.name for path in out.iterdir()}
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_disk_full_names_the_file(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OSError, match=r"cannot write .*numbers\.txt: No space left"),
+        replacing(tmp_path / "numbers.txt"),
+    ):
+        raise OSError(28, "No space left on device")
+    assert not list(tmp_path.iterdir())
