@@ -88,7 +88,8 @@ class FilmOutlines:
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool, seams: bool):
         self.geometry, self.soft = geometry, soft
         self.lines = geometry.lines
-        edges, faces = edges.of_meshes(moving), geometry.faces(moving)
+        cut = geometry.lines is not None and bool(moving[list(geometry.lines.meshes)].any())
+        edges, faces = edges.of_meshes(moving, lines=cut), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays.)
         self.edges = DeviceEdges(edges) if len(edges) else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []

@@ -68,9 +68,9 @@ class Edges:
         """Some of the edges, by index or by mask."""
         return Edges(*(getattr(self, f.name)[which] for f in fields(self)))
 
-    def of_meshes(self, wanted: np.ndarray) -> Edges:
-        """The edges that have a face in one of the meshes for which `wanted` (bool) holds, and all lines."""
-        return self.take(self.is_line | wanted[self.mesh].any(axis=1))
+    def of_meshes(self, wanted: np.ndarray, *, lines: bool = False) -> Edges:
+        """The edges that have a face in one of the meshes for which `wanted` (bool) holds. lines : and all lines?"""
+        return self.take(np.where(self.is_line, lines, wanted[self.mesh].any(axis=1)))
 
     def summary(self) -> dict[str, int]:
         counts = np.bincount(self.kind, minlength=len(EdgeKind))
