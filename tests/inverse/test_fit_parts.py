@@ -31,7 +31,7 @@ RICH = Problem(
         Free(key=("c.vertex_positions",), kind="shape", vertices=(3, 1), smoothing=12.5, start=(0.1, -2.0, 1e-30)),
         Free(key=("d.normal",), kind="material", lower=-1.5, upper=2.0, unit_length=True),
     ),
-    loss=Loss(norm="relative", pyramid=3, exclude_above=4.5),
+    loss=Loss(norm="relative", pyramid=3, exclude_above=4.5, channel="depth"),
     stage=(Stage(iterations=3, resolution=16, spp=2, rate=0.5, decay=0.1), Stage()),
     starts=Starts(count=4, move=0.1, turn=20.0, value=0.3),
     integrator={"type": "prb", "max_depth": 3, "hide_emitters": True, "scale": 0.5, "flag": False},

@@ -219,6 +219,7 @@ def test_packages_are_imported_by_their_name(root: Path, folder: str) -> None:
 ROOMS = (
     "rimlight.edge_sampling.geometry",
     "rimlight.edge_sampling.projection",
+    "rimlight.edge_sampling.rays",
     "rimlight.edge_sampling.lights",
     "rimlight.edge_sampling.smooth_lamps",
     "rimlight.edge_sampling.parametrisation",

@@ -49,7 +49,7 @@ def main(names: list[str]) -> None:
             print(f"{c.name}: not made, needs {c.needs}")
             continue
         start = time.time()
-        scene = c.scene()
+        scene = (c.reference_scene or c.scene)()
         reference = finite_differences(
             scene,
             Motion(scene, **c.motion),
