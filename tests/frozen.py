@@ -68,6 +68,16 @@ def assert_same(frozen, unfrozen):
     np.testing.assert_allclose(frozen / scale, unfrozen / scale, rtol=0, atol=1e-5)
 
 
+def assert_frozen_is_unfrozen(scene, integrator, key):
+    """The same steps, frozen and not, as `key` changes; recorded once."""
+    initial = numbers(mi.traverse(scene)[key])
+    unfrozen = losses_and_gradients(Step(), scene, integrator, key, initial)
+    step = Step()
+    frozen = step.frozen()
+    assert_same(losses_and_gradients(frozen, scene, integrator, key, initial), unfrozen)
+    assert step.calls == frozen.n_recordings == 1
+
+
 def first_cause(error: BaseException) -> str:
     """The text of the exception that started it."""
     while error.__cause__ is not None:

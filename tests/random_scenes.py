@@ -357,7 +357,7 @@ class Generator:
         size, q = self.uniform(0.35, 0.55), self.rotation()
         if self.cut:
             analytic = kind in ("sphere", "cylinder", "disk")
-            centre = centre * [1, 1, 1] + [0, 1.4, 0] if analytic else centre * [0.4, 0, 1] + [0, 0.5 * size - 0.4, 0]
+            centre = np.add(centre, [0, 1.4, 0]) if analytic else centre * [0.4, 0, 1] + [0, 0.5 * size - 0.4, 0]
         closed = kind not in ("quad", "half", "disk", "cylinder", "needle")
         uv = kind not in ("sphere", "cylinder", "disk", "tetra") and self.chance(0.6)
         material, bsdf = self.bsdf(uv, closed and kind != "torus")

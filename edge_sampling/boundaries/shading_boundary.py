@@ -284,7 +284,6 @@ class ShadingBoundary:
                 # What its own faces show, held in its direction in the vicinity.
                 faces = dr.select(reflected, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)
-                faces = dr.select(outline.is_line, 0, faces)
             L = dr.select(active & past, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)
 

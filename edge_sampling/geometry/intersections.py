@@ -73,7 +73,8 @@ class Intersections:
         self._first_face = _first_faces(geometry)
         #: The mesh of each face, on the device.
         counts = [m.face_count() for m in geometry.meshes]
-        self._mesh_of_face = _index(np.repeat(np.arange(len(counts)), counts))
+        self._meshes = len(counts)
+        self._mesh_of_face = _index(np.repeat(np.arange(self._meshes), counts))
         self._walked: dict[tuple[int, ...], _Walked] = {}
         #: Where the meshes were (held, so that the number of an array is given to no other one).
         self._at: list[mi.Float] | None = None
@@ -123,8 +124,7 @@ class Intersections:
 
     def _edges_of(self, meshes: tuple[int, ...]) -> _Walked:
         if meshes not in self._walked:
-            wanted = np.zeros(int(self._edges.mesh.max(initial=0)) + 1, bool)
-            wanted[[m for m in meshes if m < len(wanted)]] = True
+            wanted = np.isin(np.arange(self._meshes), meshes)
             self._walked[meshes] = _Walked.of(self._edges.of_meshes(wanted))
         return self._walked[meshes]
 
