@@ -18,7 +18,8 @@ from .shadow_boundary import ShadowBoundary
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
     does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see
-    `Vicinity`. `lights` : chooses one, where there are many."""
+    `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `lights` : chooses one, where
+    there are many."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -30,6 +31,7 @@ class Boundaries:
     lights_move: bool = False
     limits: tuple[str, ...] = ()
     glass: bool = False
+    mirrors: bool = False
     lights: LightChoice | None = None
 
     @property

@@ -28,7 +28,7 @@ from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.transport.paths import Depths
 
-from ._limits import Media, Moving, PartialParameters, beyond_far_plane, lasting_limits
+from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits
 
 #: Parameters of a light that move the shadows in it.
 PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction")
@@ -169,7 +169,8 @@ class BoundarySearch:
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, LightChoice.of(scene))
+        mirrors = self.from_points and self.depths.scatters(1) and any(is_mirror(s) for s in scene.shapes())
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, mirrors, LightChoice.of(scene))
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int

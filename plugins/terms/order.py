@@ -6,6 +6,7 @@ from .faces import FacePlanesTerm
 from .film import FilmTerm
 from .indirect import IndirectShadowsTerm
 from .interior import InteriorTerm
+from .mirrors import MirrorsTerm
 from .points import PointsTerm
 from .shadows import ShadowsTerm
 from .term import Term
@@ -14,6 +15,7 @@ from .term import Term
 TERMS: tuple[Term, ...] = (
     InteriorTerm(),
     FilmTerm(),
+    MirrorsTerm(),
     ShadowsTerm(),
     PointsTerm(),
     IndirectShadowsTerm(),

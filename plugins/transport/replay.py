@@ -202,12 +202,139 @@ class Replay:
         return dr.while_loop(state, lambda last, v, active, s: active, bounce, label="paths")[0]
 
 
-class ChosenVertex:
+class MovingVertex:
     """One vertex of each path, as it moves. `p` and `n`, its position and the normal of its surface, carry gradients of
     their own; in forward mode those of the chain, in backward mode `backward` hands them on.
 
     ray : camera rays, attached to the camera.
     first : the vertex that they meet.
+    log : the path up to it; and one vertex more, if `onwards`.
+    vertex, active, since : see `choose_vertex`.
+    onwards : is the direction to the vertex beyond wanted, too? It is `d`, with gradients of its own.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        ray: mi.Ray3f,
+        first: Vertex,
+        log: Log,
+        vertex: Vertex,
+        active: mi.Bool,
+        since: mi.UInt32,
+        mode: dr.ADMode,
+        *,
+        onwards: bool = False,
+    ):
+        self.chain, self.first, self.log, self.vicinity = chain, first, log, chain.vicinity
+        self.vertex, self.active, self.since = vertex, active, since
+        self.depth = mi.UInt32(vertex.depth)
+        #: Up to which vertex there is a ray to it.
+        self._last = self.depth + 1 if onwards else self.depth
+        self._start(ray)
+        at_first = self.depth == 1
+        with dr.suspend_grad():
+            other = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
+            self.si = dr.select(at_first, dr.detach(self.at_first), other)
+            beyond = log.vertex(self._last, active).ray.d
+        self.p, self.n, self.d = leaves(self.si.p, self.si.n, beyond)
+        with dr.resume_grad():
+            self.si.p, self.si.n = self.p, self.n
+            if mode == dr.ADMode.Forward:
+                p, n, o, d = _derivatives(self.at_first.p, self.at_first.n, self.start.o, self.start.d)
+                moved = self._forward(o, d)
+                for leaf, first, later in zip((self.p, self.n, self.d), (p, n, d), moved, strict=True):
+                    dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(first), later))
+                self.at_first = self.start = None
+
+    def _start(self, ray: mi.Ray3f) -> None:
+        """The first vertex, and what moves the second."""
+        si = self.at_first = seen_by_camera(ray, self.first.pi, self.active, attached=True)
+        active = self.active & (self._last > 1)
+        second = self.log.vertex(dr.full(mi.UInt32, 2, dr.width(self.depth)), active)
+        d = second.ray.d
+        if self.chain.scattering.any_mirror:
+            with dr.resume_grad():
+                numbers = self.log.numbers(self.first.depth, active)
+                d = self.chain.turned(si, si.bsdf(ray), second, numbers, active)
+        with dr.resume_grad():
+            self.start = Start(mi.Point3f(si.p), d, mi.Spectrum(1))
+
+    def _forward(self, δo: mi.Point3f, δd: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
+        """Derivatives of position, normal and direction onwards, where it is not the first."""
+        chain, log = self.chain, self.log
+
+        def bounce(depth, p, n, o, d):
+            active = self.active & (depth <= self.depth)
+            vertex = log.vertex(depth, active)
+            x, direction = leaves(vertex.ray.o, vertex.ray.d)
+            with dr.resume_grad():
+                dr.set_grad(x, o)
+                dr.set_grad(direction, d)
+            si = chain.surface(vertex, x, direction, active)
+            with dr.resume_grad():
+                moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
+                found = _derivatives(si.p, si.n, moving.o, moving.d)
+            return depth + 1, *(mi.Vector3f(v) for v in found)
+
+        zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
+        # A vertex that does not slide knows nothing of those before.
+        first, chained = dr.maximum(self.since, 2), self.since == 1
+        _, p, n, _, d = dr.while_loop(
+            (
+                first,
+                mi.Vector3f(zero),
+                mi.Vector3f(zero),
+                dr.select(chained, mi.Vector3f(δo), 0),
+                dr.select(chained, mi.Vector3f(δd), 0),
+            ),
+            lambda depth, *_: self.active & (depth <= self.depth),
+            bounce,
+            label="motion of a vertex",
+        )
+        return p, n, d
+
+    def backward(self) -> None:
+        """Hand the gradients on to the surfaces, and to the camera rays."""
+        chain, log = self.chain, self.log
+        δp, δn, δd = dr.grad(self.p), dr.grad(self.n), dr.grad(self.d)
+        dr.eval(δp, δn, δd)
+
+        def bounce(depth, δp, δn, δd):
+            active = self.active & (depth >= dr.maximum(self.since, 2))
+            vertex = log.vertex(depth, active)
+            o, d = leaves(vertex.ray.o, vertex.ray.d)
+            si = chain.surface(vertex, o, d, active)
+            with dr.resume_grad():
+                moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
+                value = dr.dot(δp, moving.o) + dr.dot(δn, si.n) + dr.dot(δd, moving.d)
+                dr.backward_from(dr.select(active, value, 0), flags=_FLAGS)
+                δo, δd = dr.grad(o), dr.grad(d)
+            return depth - 1, mi.Vector3f(δo), mi.Vector3f(0), δd
+
+        with dr.suspend_grad():
+            at_first = self.depth == 1
+            later = lambda g: dr.select(at_first, 0, mi.Vector3f(g))
+            _, δo, _, to_first = dr.while_loop(
+                (mi.UInt32(self.depth), later(δp), later(δn), later(δd)),
+                lambda depth, *_: self.active & (depth >= dr.maximum(self.since, 2)),
+                bounce,
+                label="motion of a vertex",
+            )
+        with dr.resume_grad():
+            si, start = self.at_first, self.start
+            value = dr.dot(dr.select(at_first, δp, 0), si.p) + dr.dot(dr.select(at_first, δn, 0), si.n)
+            to_first = dr.select(at_first, mi.Vector3f(δd), to_first)
+            chained = self.active & (self._last > 1) & (self.since == 1)
+            value += dr.select(chained & ~at_first, dr.dot(δo, start.o), 0)
+            value += dr.select(chained, dr.dot(to_first, start.d), 0)
+            dr.backward_from(value, flags=_FLAGS)
+
+
+class ChosenVertex(MovingVertex):
+    """One vertex of each path, chosen in proportion to its throughput, as it moves.
+
+    sampler : of the paths.
     glass : see `Vicinity`.
     """
 
@@ -221,119 +348,24 @@ class ChosenVertex:
         mode: dr.ADMode,
         glass: bool,
     ):
-        self.scene, self.first, self.vicinity = scene, first, Vicinity.of(first.pi, glass)
-        self.chain = Chain(scene, self.vicinity)
+        vicinity = Vicinity.of(first.pi, glass)
+        chain = Chain(scene, vicinity)
         found = []
 
         def follow(log):
             def note(vertex, numbers, onwards, active):
                 if log is not None:
-                    if self.chain.scattering.any_mirror:
+                    if chain.scattering.any_mirror:
                         log.leave(vertex.depth, vertex.β, numbers, active)
                     log.arrive(vertex.depth + 1, onwards, active)
 
             random = sampler if log is not None else sampler.clone()
-            found[:] = choose_vertex(scene, random, first, depths, self.vicinity, first.pi.is_valid(), note)
+            found[:] = choose_vertex(scene, random, first, depths, vicinity, first.pi.is_valid(), note)
             return found[0].depth
 
-        self.log, self.depth = written(scene, first.ray, 1, depths, follow)
-        self.vertex, self.active, self.since, self.density = found
-        self._start(ray)
-        at_first = self.depth == 1
-        with dr.suspend_grad():
-            other = self.vertex.pi.compute_surface_interaction(self.vertex.ray, mi.RayFlags.All, self.active)
-            self.si = dr.select(at_first, dr.detach(self.at_first), other)
-        self.p, self.n = leaves(self.si.p, self.si.n)
-        with dr.resume_grad():
-            self.si.p, self.si.n = self.p, self.n
-            if mode == dr.ADMode.Forward:
-                p, n, o, d = _derivatives(self.at_first.p, self.at_first.n, self.start.o, self.start.d)
-                moved = self._forward(o, d)
-                dr.set_grad(self.p, dr.select(at_first, p, moved[0]))
-                dr.set_grad(self.n, dr.select(at_first, n, moved[1]))
-                self.at_first = self.start = None
-
-    def _start(self, ray: mi.Ray3f) -> None:
-        """The first vertex, and what moves the second."""
-        active = self.active
-        si = self.at_first = seen_by_camera(ray, self.first.pi, active, attached=True)
-        second = self.log.vertex(dr.full(mi.UInt32, 2, dr.width(self.depth)), active & (self.depth > 1))
-        d = second.ray.d
-        if self.chain.scattering.any_mirror:
-            with dr.resume_grad():
-                numbers = self.log.numbers(self.first.depth, active & (self.depth > 1))
-                d = self.chain.turned(si, si.bsdf(ray), second, numbers, active & (self.depth > 1))
-        with dr.resume_grad():
-            self.start = Start(mi.Point3f(si.p), d, mi.Spectrum(1))
-
-    def _forward(self, δo: mi.Point3f, δd: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """Derivatives of position and normal, where it is not the first."""
-        chain, log = self.chain, self.log
-
-        def bounce(depth, p, n, o, d):
-            active = self.active & (depth <= self.depth)
-            vertex = log.vertex(depth, active)
-            x, direction = leaves(vertex.ray.o, vertex.ray.d)
-            with dr.resume_grad():
-                dr.set_grad(x, o)
-                dr.set_grad(direction, d)
-            si = chain.surface(vertex, x, direction, active)
-            with dr.resume_grad():
-                moving = chain.along(log, depth, si, vertex, active & (depth < self.depth))
-                found = _derivatives(si.p, si.n, moving.o, moving.d)
-            return depth + 1, *(mi.Vector3f(v) for v in found)
-
-        zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
-        # A vertex that does not slide knows nothing of those before.
-        first, chained = dr.maximum(self.since, 2), self.since == 1
-        return dr.while_loop(
-            (
-                first,
-                mi.Vector3f(zero),
-                mi.Vector3f(zero),
-                dr.select(chained, mi.Vector3f(δo), 0),
-                dr.select(chained, mi.Vector3f(δd), 0),
-            ),
-            lambda depth, *_: self.active & (depth <= self.depth),
-            bounce,
-            label="motion of a vertex",
-        )[1:3]
-
-    def backward(self) -> None:
-        """Hand the gradients on to the surfaces, and to the camera rays."""
-        chain, log = self.chain, self.log
-        δp, δn = dr.grad(self.p), dr.grad(self.n)
-        dr.eval(δp, δn)
-
-        def bounce(depth, δp, δn, δd):
-            active = self.active & (depth >= dr.maximum(self.since, 2))
-            vertex = log.vertex(depth, active)
-            o, d = leaves(vertex.ray.o, vertex.ray.d)
-            si = chain.surface(vertex, o, d, active)
-            with dr.resume_grad():
-                moving = chain.along(log, depth, si, vertex, active & (depth < self.depth))
-                value = dr.dot(δp, moving.o) + dr.dot(δn, si.n) + dr.dot(δd, moving.d)
-                dr.backward_from(dr.select(active, value, 0), flags=_FLAGS)
-                δo, δd = dr.grad(o), dr.grad(d)
-            return depth - 1, mi.Vector3f(δo), mi.Vector3f(0), δd
-
-        with dr.suspend_grad():
-            at_first = self.depth == 1
-            later = lambda g: dr.select(at_first, 0, mi.Vector3f(g))
-            zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
-            _, δo, _, δd = dr.while_loop(
-                (mi.UInt32(self.depth), later(δp), later(δn), zero),
-                lambda depth, *_: self.active & (depth >= dr.maximum(self.since, 2)),
-                bounce,
-                label="motion of a vertex",
-            )
-        with dr.resume_grad():
-            si, start = self.at_first, self.start
-            value = dr.dot(dr.select(at_first, δp, 0), si.p) + dr.dot(dr.select(at_first, δn, 0), si.n)
-            value += dr.select(
-                self.active & ~at_first & (self.since == 1), dr.dot(δo, start.o) + dr.dot(δd, start.d), 0
-            )
-            dr.backward_from(value, flags=_FLAGS)
+        log, _ = written(scene, first.ray, 1, depths, follow)
+        vertex, active, since, self.density = found
+        super().__init__(chain, ray, first, log, vertex, active, since, mode)
 
 
 def written(

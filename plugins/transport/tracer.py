@@ -141,7 +141,7 @@ class PathTracer:
         beyond : at least so many more vertices may follow it.
         """
         pi = self.first_hit(ray, True)
-        vertex = _camera_vertex(ray, pi)
+        vertex = camera_vertex(ray, pi)
         if not self.scatters(2):
             si, no = seen_by_camera(ray, pi, pi.is_valid(), attached=True), mi.Bool(False)
             still = Vicinity(mi.Float(0))
@@ -162,7 +162,8 @@ class PathTracer:
         return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline, lune, self.lights)[0]
 
 
-def _camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
+def camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
+    """The first vertex of a path, which a camera ray meets."""
     width = dr.width(pi.t)
     one, β = dr.full(mi.UInt32, 1, width), dr.full(mi.Spectrum, 1, width)
     no = dr.full(mi.Bool, False, width)

@@ -1,0 +1,105 @@
+"""Rays that touch the outline of what they meet, wherever they come from.
+
+A ray o + t·d touches the outline of a shape at its point q. With the unit vector n across the ray and the outline,
+
+    g = n · (q − o − t·d)
+
+vanishes where it touches. As anything moves, g follows the material point q and the ray, with n and t held; so the
+position on the film, or whatever else the ray depends on, must change so that g stays 0. For the contour of a curved
+surface n is its normal, and q may be any material point close by: the contour slides over the surface, but across n it
+moves as the material does. Where two surfaces cut each other, n is divided between their normals, n = α·n₁ + β·n₂, and
+each part follows its own surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight.edge_sampling.parametrisation import material_point
+
+#: Barycentric coordinate from which on a point is taken to lie inside of a triangle.
+INSIDE = 1e-3
+
+
+@dataclass
+class Touch:
+    """Where rays touch outlines.
+
+    n : mi.Vector3f, across ray and outline. t : mi.Float, distance along the ray. Detached.
+    moved : mi.Float, n · q, attached to the shapes.
+    """
+
+    n: mi.Vector3f
+    t: mi.Float
+    moved: mi.Float
+
+
+def touch_outline(
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    near: tuple[mi.Ray3f, mi.PreliminaryIntersection3f],
+    far: tuple[mi.Ray3f, mi.PreliminaryIntersection3f],
+    reach: mi.Float,
+    active: mi.Bool,
+) -> Touch:
+    """The outline between two rays that are next to each other, of which one meets it, and the other does not.
+
+    ray : one of both. near : the one that meets it, and what that is. far : the other one.
+    reach : about how far the two are apart there, scene units.
+    """
+    is_mesh = near[1].shape.is_mesh()
+    on_mesh = _of_mesh(ray, near, far, active & is_mesh)
+    if all(s.is_mesh() for s in scene.shapes()):
+        return on_mesh
+    on_curved = _of_curved(scene, ray, near, reach, active & ~is_mesh)
+    with dr.resume_grad():
+        return Touch(*(dr.select(is_mesh, getattr(on_mesh, k), getattr(on_curved, k)) for k in ("n", "t", "moved")))
+
+
+def _of_mesh(ray, near, far, active) -> Touch:
+    near_ray, pi = near
+    p = []
+    with dr.resume_grad():
+        for u, v in ((0, 0), (1, 0), (0, 1)):
+            corner = mi.PreliminaryIntersection3f(pi)
+            corner.prim_uv = mi.Point2f(u, v)
+            p.append(material_point(near_ray, corner, active).p)
+    q = [dr.detach(c) for c in p]
+    # Beyond which of the edges is the other ray?
+    n = dr.cross(q[1] - q[0], q[2] - q[0])
+    at = far[0](dr.dot(n, q[0] - far[0].o) / dr.dot(n, far[0].d))
+    b = [dr.dot(n, dr.cross(q[(i + 2) % 3] - q[(i + 1) % 3], at - q[(i + 1) % 3])) for i in range(3)]
+    least = dr.minimum(b[0], dr.minimum(b[1], b[2]))
+    pick = lambda c, k: dr.select(b[0] == least, c[(0 + k) % 3], dr.select(b[1] == least, c[(1 + k) % 3], c[(2 + k) % 3]))
+    start, end = pick(q, 1), pick(q, 2)
+    e = end - start
+    across = dr.normalize(dr.cross(e, ray.d))
+    aside = dr.cross(ray.d, across)
+    λ = dr.clip(dr.dot(aside, ray.o - start) / dr.dot(aside, e), 0, 1)
+    t = dr.dot(dr.lerp(start, end, λ) - ray.o, ray.d)
+    with dr.resume_grad():
+        moved = dr.dot(across, dr.lerp(pick(p, 1), pick(p, 2), λ))
+    return Touch(across, t, moved)
+
+
+def _of_curved(scene, ray, near, reach, active) -> Touch:
+    near_ray, pi = near
+    with dr.resume_grad():
+        si = material_point(near_ray, pi, active, mi.RayFlags.All)
+    at = dr.detach(si)
+    # Along the contour, what turns away from the viewer ends; a rim has a tangent of its own.
+    tangent = dr.cross(at.n, ray.d)
+    for shape in scene.shapes():
+        kind = shape.class_name()
+        if kind == "Disk":
+            tangent = dr.select(pi.shape == mi.ShapePtr(shape), at.dp_dv, tangent)
+        elif kind == "Cylinder":
+            from_rim = dr.minimum(at.uv.y, 1 - at.uv.y) * dr.norm(at.dp_dv)
+            rim = (pi.shape == mi.ShapePtr(shape)) & (from_rim < 2 * reach)
+            tangent = dr.select(rim, at.dp_du, tangent)
+    across = dr.normalize(dr.cross(tangent, ray.d))
+    with dr.resume_grad():
+        return Touch(across, dr.dot(at.p - ray.o, ray.d), dr.dot(across, si.p))

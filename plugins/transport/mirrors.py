@@ -1,0 +1,274 @@
+"""What perfect mirrors and glass show to the camera, as a function of the position on the film.
+
+Behind a chain of mirrors there is no projection by which an edge could be found on the film. So its image is looked
+for: along a short segment of the film, what the chain ends at is compared at both ends, and where it differs, the
+segment is bisected (`terms/mirrors.py`). Here chains are followed, and two of them compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight.edge_sampling.rays import spawn_ray
+
+from .log import Log
+from .paths import Vertex
+from .scattering import Next, Numbers
+from .tracer import PathTracer, camera_vertex
+
+#: Two points close to each other on the film show one surface, if they are at most so many times as far apart as the
+#: one of them that moves less has it; and their normals likewise.
+APART = 3.0
+
+#: What rounding may add to the distance of two points, in units in the last place of their coordinates; and to the
+#: difference of two normals.
+ROUNDING, BENT = 256, 1e-3
+
+#: Part of a pixel by which film positions differ of which derivatives along the film are made.
+STEP = 0.25
+
+
+@dataclass
+class RayDerivative:
+    """How a ray moves along one axis of the film, per pixel (Igehy 1999, "Tracing ray differentials")."""
+
+    o: mi.Vector3f
+    d: mi.Vector3f
+
+    def at(self, ray: mi.Ray3f, si: mi.SurfaceInteraction3f) -> mi.Vector3f:
+        """Of the point in which the ray meets a surface."""
+        across = self.o + si.t * self.d
+        return mi.Vector3f(across - ray.d * (dr.dot(si.n, across) / dr.dot(si.n, ray.d)))
+
+    def beyond(self, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, d: mi.Vector3f, η: mi.Float) -> RayDerivative:
+        """Of the ray that a mirror, or glass of the relative index η, makes of it, whose direction is d.
+
+        Both have d = r·d₀ + γ·n with a number r; γ follows from the length of d.
+        """
+        p, n = self.at(ray, si), mi.Vector3f(si.sh_frame.n)
+        moved = normal_derivative(si, p)
+        r = dr.select(dr.dot(d, n) * dr.dot(ray.d, n) > 0, dr.rcp(η), 1)
+        γ = dr.dot(d - r * ray.d, n)
+        rest = r * self.d + γ * moved
+        return RayDerivative(p, rest - n * (dr.dot(d, rest) / dr.dot(d, n)))
+
+
+def normal_derivative(si: mi.SurfaceInteraction3f, moved: mi.Vector3f) -> mi.Vector3f:
+    """By how much the shading normal changes, where the point moves by so much."""
+    uu, vv, uv = dr.squared_norm(si.dp_du), dr.squared_norm(si.dp_dv), dr.dot(si.dp_du, si.dp_dv)
+    a, b, det = dr.dot(moved, si.dp_du), dr.dot(moved, si.dp_dv), uu * vv - uv * uv
+    inverse = dr.select(det > 0, dr.rcp(det), 0)
+    return inverse * ((vv * a - uv * b) * si.dn_du + (uu * b - uv * a) * si.dn_dv)
+
+
+class FilmRays:
+    """Camera rays at positions of a film, all with the same random numbers.
+
+    sensor : no `batch`. sampler : for these numbers, if there are any.
+    """
+
+    def __init__(self, sensor: mi.Sensor, sampler: mi.Sampler):
+        film = sensor.film()
+        self.sensor = sensor
+        self.offset, self.size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
+        self.time = mi.Float(sensor.shutter_open())
+        if sensor.shutter_open_time() > 0:
+            self.time += sampler.next_1d() * sensor.shutter_open_time()
+        self.wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        self.lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+
+    def at(self, u: mi.Point2f, active: mi.Bool | bool = True) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """Rays and their weights. u : mi.Point2f, pixels."""
+        on_film = (u - self.offset) / self.size
+        return self.sensor.sample_ray_differential(self.time, self.wavelength, on_film, self.lens, active)
+
+    def derivative(self, u: mi.Point2f, axis: mi.Vector2f) -> RayDerivative:
+        """Along a unit vector of the film."""
+        (a, _), (b, _) = (self.at(u + sign * STEP * axis) for sign in (-1, 1))
+        return RayDerivative(mi.Vector3f(b.o - a.o) / (2 * STEP), mi.Vector3f(b.d - a.d) / (2 * STEP))
+
+
+@dataclass
+class Seen:
+    """What a chain ends at, and how it comes there.
+
+    way : mi.UInt32, equal for chains that take the same way.
+    p, n : mi.Vector3f, the point and its shading normal; of rays that meet nothing, the direction, and 0.
+    moved, turned : mi.Float, how much p and n change per pixel.
+    shown : mi.Bool, by a mirror, or by glass that bends rays?
+    """
+
+    way: mi.UInt32
+    p: mi.Vector3f
+    n: mi.Vector3f
+    moved: mi.Float
+    turned: mi.Float
+    shown: mi.Bool
+
+    @staticmethod
+    def nothing(width: int) -> Seen:
+        return dr.zeros(Seen, width)
+
+    def differs(self, other: Seen, distance: mi.Float) -> mi.Bool:
+        """Does something jump between two chains, so many pixels apart?"""
+        return (self.shown | other.shown) & ((self.way != other.way) | self.is_apart_from(other, distance))
+
+    def is_apart_from(self, other: Seen, distance: mi.Float) -> mi.Bool:
+        """Is there a gap, or a crease, between two points that are seen so many pixels apart?"""
+        apart = APART * distance * dr.minimum(self.moved, other.moved)
+        scale = dr.maximum(dr.max(dr.abs(self.p)), dr.max(dr.abs(other.p)))
+        gap = dr.norm(self.p - other.p) > apart + ROUNDING * dr.epsilon(mi.Float) * scale
+        return gap | (dr.norm(self.n - other.n) > APART * distance * dr.minimum(self.turned, other.turned) + BENT)
+
+
+@dataclass
+class Link:
+    """A vertex of a chain, and how that goes on.
+
+    seen : of this vertex alone; its way is the shape.
+    onwards : the next ray, and what that meets.
+    ways : derivatives of the next ray.
+    lobe : mi.UInt32, 0 if there is no next vertex, 1 if the next ray has the same direction, 2 otherwise.
+    numbers : random numbers.
+    """
+
+    seen: Seen
+    onwards: Next
+    ways: tuple[RayDerivative, ...]
+    lobe: mi.UInt32
+    numbers: Numbers
+
+
+@dataclass
+class Parting:
+    """Where two chains part.
+
+    a, b : the vertices at which they do: what the same ray of both meets.
+    along, across : derivatives of the ray to a.
+    found : mi.Bool, do they, behind a mirror?
+    """
+
+    a: Vertex
+    b: Vertex
+    along: RayDerivative
+    across: RayDerivative
+    found: mi.Bool
+
+
+class Chains:
+    """Follows chains of mirrors from the camera."""
+
+    def __init__(self, tracer: PathTracer, rays: FilmRays):
+        self.tracer, self.rays = tracer, rays
+
+    def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:
+        """What the camera sees at u."""
+        ray = mi.Ray3f(self.rays.at(u, active)[0])
+        return camera_vertex(ray, self.tracer.first_hit(ray, active))
+
+    def link(self, vertex: Vertex, ways: tuple[RayDerivative, ...], choice: mi.UInt32, active: mi.Bool) -> Link:
+        """A vertex of a chain.
+
+        ways : derivatives of the ray to it, the first along the axis on which what is seen is compared.
+        choice : by which the chain chooses between what is reflected and what is let through.
+        """
+        scene, ray, pi = self.tracer.scene, vertex.ray, vertex.pi
+        met = active & pi.is_valid()
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, met)
+        numbers = Numbers(mi.Point2f(0), mi.sample_tea_float32(choice, vertex.depth), mi.Point2f(0.5))
+        goes_on = met & self.tracer.scatters(vertex.depth)
+        bs, weight = si.bsdf(ray).sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, goes_on)
+        mirrored, through = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
+        goes_on &= mirrored & dr.any(weight != 0)
+        next_ray = spawn_ray(scene, si, si.to_world(bs.wo))
+        next_pi = scene.ray_intersect_preliminary(next_ray, active=goes_on)
+        onwards = Next(next_ray, next_pi, weight, bs.eta, goes_on & through, mirrored, mirrored)
+        lobe = dr.select(goes_on, dr.select(through, mi.UInt32(1), 2), 0)
+        at = ways[0].at(ray, si)
+        beyond = tuple(
+            dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
+        )
+        shape = dr.reinterpret_array(mi.UInt32, pi.shape) ^ (dr.reinterpret_array(mi.UInt32, pi.instance) << 16)
+        seen = Seen(
+            dr.select(met, shape, 0),
+            dr.select(met, mi.Vector3f(si.p), ray.d),
+            dr.select(met, mi.Vector3f(si.sh_frame.n), 0),
+            dr.norm(dr.select(met, at, ways[0].d)),
+            dr.norm(dr.select(met, normal_derivative(si, at), 0)),
+            mi.Bool(False),
+        )
+        return Link(seen, onwards, beyond, lobe, numbers)
+
+    def end(self, u: mi.Point2f, axis: mi.Vector2f, choice: mi.UInt32, active: mi.Bool) -> Seen:
+        """What the chain from u ends at.
+
+        axis : of the film, along which that is to be compared.
+        """
+
+        def step(vertex, derivative, seen, active):
+            link = self.link(vertex, (derivative,), choice, active)
+            found = link.seen
+            found.way = _mixed(seen.way, 4 * found.way + link.lobe)
+            found.shown = mi.Bool(seen.shown)
+            goes_on = active & (link.lobe > 0)
+            found = dr.select(active, found, seen)
+            found.shown |= active & (link.lobe == 2)
+            return after(vertex, link), link.ways[0], found, goes_on
+
+        state = (self.first(u, active), self.rays.derivative(u, axis), Seen.nothing(dr.width(u)), active)
+        return dr.while_loop(state, lambda v, δ, s, active: active, step, label="chain of mirrors")[2]
+
+    def part(
+        self,
+        first: tuple[Vertex, Vertex],
+        u: tuple[mi.Point2f, mi.Point2f],
+        axis: mi.Vector2f,
+        choice: mi.UInt32,
+        active: mi.Bool,
+        log: Log | None,
+    ) -> Parting:
+        """Where two chains part that start close to each other.
+
+        first : what the camera sees at both positions u.
+        log : where the first chain is written down; None: nowhere.
+        """
+        distance = dr.norm(u[1] - u[0])
+        aside = mi.Vector2f(axis.y, axis.x)
+        rays = self.rays
+
+        def step(a, b, of_a, of_b, shown, found, active):
+            here, there = self.link(a, of_a, choice, active), self.link(b, of_b, choice, active)
+            same_shape = here.seen.way == there.seen.way
+            parts = ~same_shape | here.seen.is_apart_from(there.seen, distance)
+            found |= active & parts & shown
+            goes_on = active & ~parts & (here.lobe > 0) & (here.lobe == there.lobe)
+            if log is not None:
+                log.leave(a.depth, a.β, here.numbers, goes_on)
+                log.arrive(a.depth + 1, here.onwards, goes_on)
+            a, b = (dr.select(goes_on, after(v, link), v) for v, link in ((a, here), (b, there)))
+            of_a = tuple(dr.select(goes_on, new, old) for new, old in zip(here.ways, of_a, strict=True))
+            of_b = tuple(dr.select(goes_on, new, old) for new, old in zip(there.ways, of_b, strict=True))
+            return a, b, of_a, of_b, shown | (goes_on & (here.lobe == 2)), found, goes_on
+
+        if log is not None:
+            log.arrive(first[0].depth, first[0], active)
+        no = dr.full(mi.Bool, False, dr.width(active))
+        of_a = rays.derivative(u[0], axis), rays.derivative(u[0], aside)
+        of_b = (rays.derivative(u[1], axis),)
+        state = (*first, of_a, of_b, no, mi.Bool(no), mi.Bool(active))
+        a, b, of_a, _, _, found, _ = dr.while_loop(state, lambda *state: state[-1], step, label="chains of mirrors")
+        return Parting(a, b, *of_a, found)
+
+
+def after(vertex: Vertex, link: Link) -> Vertex:
+    """The next vertex of a chain."""
+    onwards = link.onwards
+    β, η = vertex.β * onwards.weight, vertex.η * onwards.η
+    return Vertex(mi.Ray3f(onwards.ray), onwards.pi, vertex.depth + 1, β, η, onwards.mirrored, onwards.slides)
+
+
+def _mixed(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
+    return mi.sample_tea_32(a, b, 2)[0]
