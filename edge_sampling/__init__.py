@@ -12,9 +12,10 @@ from .choice.silhouettes import Silhouettes
 from .choice.views import Cone, Lobe, View
 from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .geometry.intersections import Intersections
-from .geometry.meshes import Geometry, jumping_textures, objects_below
+from .geometry.meshes import Geometry, objects_below
 from .geometry.sources import Sources
 from .geometry.t_junctions import t_junctions
+from .geometry.texture_lines import TextureLines, jumping_textures
 from .lights import Lights, has_hard_beam
 from .projection.film_parts import Batch, FilmPart, film_parts
 from .projection.sensors import Projection
@@ -45,6 +46,7 @@ __all__ = [
     "Silhouettes",
     "SmoothLamps",
     "Sources",
+    "TextureLines",
     "View",
     "Weld",
     "film_parts",

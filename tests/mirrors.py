@@ -72,3 +72,60 @@ def faceted() -> mi.Scene:
     shape = mesh("ball", 0.6 * vertices + [0, 0.4, 0.3], faces, normals=True, bsdf={"type": "conductor"})
     at = camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35)
     return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), sky=constant(0.5))
+
+
+# ---------------------- Textures that jump ----------------------
+
+
+def checkers(colour0=0.15, colour1=(0.8, 0.6, 0.3), scale=(3, 2), turned: float = 20) -> dict:
+    to_uv = mi.ScalarTransform3f().rotate(turned).scale(list(scale))
+    colours = {"color0": {"type": "rgb", "value": [colour0] * 3}, "color1": {"type": "rgb", "value": list(colour1)}}
+    return {"type": "checkerboard", "to_uv": to_uv, **colours}
+
+
+def texels(channels: int, seed: int = 0, size=(5, 4), lowest: float = 0.1) -> dict:
+    data = np.random.default_rng(seed).uniform(lowest, 0.9, (*size, channels)).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
+
+
+def patterned(kind: str, name: str = "board", at=(0, 0.1, 0), turned=(0.2, 1, 0.1), **bsdf: Any) -> dict:
+    place = mi.ScalarTransform4f().translate(list(at)).rotate(list(turned), 35).scale(0.9)
+    return {"type": kind, "id": name, "to_world": place, "bsdf": bsdf}
+
+
+def board(**bsdf: Any) -> mi.Scene:
+    """A plate with a pattern before a floor with another one."""
+    floor = {"type": "rectangle", "id": "floor", "bsdf": {"type": "diffuse", "reflectance": checkers(scale=(5, 4))}}
+    floor["to_world"] = mi.ScalarTransform4f().translate([0, -0.9, 0]).rotate([1, 0, 0], -90).scale(2)
+    plate = patterned("rectangle", **bsdf)
+    return scene(sensor=camera((0.6, 1.4, -3.4), (0, 0, 0)), board=plate, floor=floor, sky=constant(0.6), lamp=lamp())
+
+
+def checkerboard() -> mi.Scene:
+    return board(type="twosided", nested={"type": "diffuse", "reflectance": checkers()})
+
+
+def nearest() -> mi.Scene:
+    return board(type="twosided", nested={"type": "diffuse", "reflectance": texels(3)})
+
+
+def leaf() -> mi.Scene:
+    opacity = texels(1, seed=2, lowest=-0.6)
+    opacity["bitmap"] = mi.Bitmap((np.array(opacity["bitmap"]) > 0.2).astype(np.float32))
+    leaf = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.7, 0.1]}}}
+    return board(type="mask", opacity=opacity, nested=leaf)
+
+
+def bumps() -> mi.Scene:
+    heights = texels(1, seed=4, size=(6, 6))
+    heights["filter_type"] = "bilinear"
+    return board(type="twosided", nested={"type": "bumpmap", "texture": heights, "scale": 0.3, "bsdf": diffuse(0.6)})
+
+
+def checkered_ball() -> mi.Scene:
+    """A smooth ball with a checkerboard, and what a mirror shows of it."""
+    thing = {"type": "sphere", "id": "ball", "center": [0.1, 0.7, 0.1], "radius": 0.5}
+    thing["bsdf"] = {"type": "diffuse", "reflectance": checkers(scale=(4, 3))}
+    floor = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "mirror", bsdf={"type": "conductor"})
+    at = camera((0.6, 1.9, -3.4), (0.1, 0.2, 0))
+    return scene(sensor=at, ball=thing, mirror=floor, sky=constant(0.4), lamp=lamp())

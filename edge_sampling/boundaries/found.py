@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.choice.silhouettes import Silhouettes
+from rimlight.edge_sampling.geometry.texture_lines import TextureLines
 
 from .face_planes import FacePlanes
 from .film_boundary import FilmBoundary
@@ -18,7 +19,8 @@ from .shadow_boundary import ShadowBoundary
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
     does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see
-    `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `lights` : chooses one, where
+    `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `textures` :
+    where those jump that the camera may see move. `lights` : chooses one, where
     there are many."""
 
     film: FilmBoundary | None = None
@@ -32,6 +34,7 @@ class Boundaries:
     limits: tuple[str, ...] = ()
     glass: bool = False
     mirrors: bool = False
+    textures: TextureLines | None = None
     lights: LightChoice | None = None
 
     @property

@@ -158,9 +158,9 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     if any(k.startswith("face_") for k in mi.traverse(mesh).properties):
         return True
     objects = list(objects_below(mesh).values())
-    if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or _is_map(o)) for o in objects):
+    if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or is_map(o)) for o in objects):
         return True
-    return not mesh.has_vertex_texcoords() and any(_has_place(o) for o in objects)
+    return not mesh.has_vertex_texcoords() and any(has_place(o) for o in objects)
 
 
 def lets_light_through(shape: Any) -> bool:
@@ -170,14 +170,15 @@ def lets_light_through(shape: Any) -> bool:
 
 def has_normal_map(shape: Any) -> bool:
     """Is a shape shaded by other normals than its own, or those of its vertices?"""
-    return any(isinstance(o, mi.BSDF) and _is_map(o) for o in objects_below(shape).values())
+    return any(isinstance(o, mi.BSDF) and is_map(o) for o in objects_below(shape).values())
 
 
-def _is_map(bsdf: mi.BSDF) -> bool:
+def is_map(bsdf: mi.BSDF) -> bool:
+    """Does it shade by normals of its own?"""
     return bsdf.class_name() in ("BumpMap", "NormalMap")
 
 
-def _has_place(texture: Any) -> bool:
+def has_place(texture: Any) -> bool:
     """Is it a texture that varies over texture coordinates?"""
     kinds = ("Bitmap", "Checkerboard")
     return isinstance(texture, mi.Texture) and texture.class_name().startswith(kinds) and texture.is_spatially_varying()
@@ -187,19 +188,6 @@ def _concat(buffers: list[mi.Float]) -> mi.Float:
     if not buffers:
         return dr.zeros(mi.Float, 3)
     return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
-
-
-def jumping_textures(scene: mi.Scene) -> list[str]:
-    """Names of what jumps inside of faces: checkerboards, bitmaps with the `nearest` filter, and bump maps (where a
-    bitmap is continuous, its slope jumps at every texel)."""
-    uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if m.has_vertex_texcoords()]
-    uv = np.concatenate([[[0, 0], [1, 1]], *uv])
-    return [
-        f'"{name}" ({o.class_name().partition("TextureImpl")[0]})'
-        for name, o in objects_below(scene).items()
-        if (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
-        or (_has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))
-    ]
 
 
 def objects_below(root: mi.Object) -> dict[str, Any]:
@@ -230,35 +218,3 @@ def objects_below(root: mi.Object) -> dict[str, Any]:
         found[name].traverse(Children(name, found, seen))
         queue += list(found)[before:]
     return found
-
-
-def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 256, steps: int = 22) -> bool:
-    """Bisect random segments towards their steeper half: where a texture is continuous, the difference dies out.
-
-    lower, upper : of the texture coordinates.
-    """
-    with dr.suspend_grad():
-        rng = mi.PCG32(size=pairs)
-        si = dr.zeros(mi.SurfaceInteraction3f, pairs)
-        if mi.is_spectral:
-            si.wavelengths = type(si.wavelengths)(550)
-
-        def value(uv: mi.Point2f) -> mi.Spectrum:
-            si.uv = uv
-            return texture.eval(si)
-
-        difference = lambda f, g: dr.max(dr.abs(f - g))
-        point = lambda: dr.lerp(
-            mi.Point2f(lower), mi.Point2f(upper), mi.Point2f(rng.next_float32(), rng.next_float32())
-        )
-        p, q = point(), point()
-        at_p, at_q = value(p), value(q)
-        before = difference(at_p, at_q)
-        for _ in range(steps):
-            middle = 0.5 * (p + q)
-            at_middle = value(middle)
-            left = difference(at_p, at_middle) > difference(at_middle, at_q)
-            p, at_p = dr.select(left, p, middle), dr.select(left, at_p, at_middle)
-            q, at_q = dr.select(left, middle, q), dr.select(left, at_middle, at_q)
-        # Rounding makes differences, too, where a texture is constant.
-        return bool(dr.any((before > 1e-3 * dr.max(before)) & (difference(at_p, at_q) > 0.3 * before)))

@@ -21,6 +21,7 @@ from rimlight.edge_sampling import (
     ShadowBoundary,
     Silhouettes,
     Sources,
+    TextureLines,
     find_welded_edges,
 )
 from rimlight.edge_sampling.boundaries.found import Boundaries
@@ -170,7 +171,10 @@ class BoundarySearch:
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights
         mirrors = self.from_points and self.depths.scatters(1) and any(is_mirror(s) for s in scene.shapes())
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, mirrors, LightChoice.of(scene))
+        textures = TextureLines(scene.shapes() if mirrors else moving.on_film) if self.from_points else ()
+        textures = textures if len(textures) else None
+        lights = LightChoice.of(scene)
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, mirrors, textures, lights)
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from .bisection import BisectionTerm
 from .faces import FacePlanesTerm
 from .film import FilmTerm
 from .indirect import IndirectShadowsTerm
 from .interior import InteriorTerm
-from .mirrors import MirrorsTerm
 from .points import PointsTerm
 from .shadows import ShadowsTerm
 from .term import Term
@@ -15,7 +15,7 @@ from .term import Term
 TERMS: tuple[Term, ...] = (
     InteriorTerm(),
     FilmTerm(),
-    MirrorsTerm(),
+    BisectionTerm(),
     ShadowsTerm(),
     PointsTerm(),
     IndirectShadowsTerm(),

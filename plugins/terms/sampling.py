@@ -10,7 +10,7 @@ import mitsuba as mi
 #: interior term has the seed itself: its samples are those of the image.
 SALT = {"film boundary": 0xFFFFFFFF, "shadows from lights": 0xAAAAAAAA, "edges from points": 0x55555555}
 SALT |= {"planes of faces": 0x33333333, "shadows in indirect light": 0x99999999}
-SALT |= {"edges in mirrors": 0x66666666}
+SALT |= {"mirrors and textures": 0x66666666}
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
 LINE = 16

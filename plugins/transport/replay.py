@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -145,7 +146,7 @@ class Replay:
     def backward(self, δL: mi.Spectrum) -> Start:
         """Propagate the gradient of a loss with respect to the light that arrives by way of the vertex to the
         parameters; returns the gradient with respect to the start."""
-        log, last = written(self.scene, self.vertex.ray, 2, self.depths, self._follow)
+        log, last = written(self.scene, self.vertex.ray, 2, self.depths, self._follow, lambda last: last)
         chain, scattering = self.chain, self.chain.scattering
         first = dr.detach(self.start.weight)
 
@@ -350,7 +351,6 @@ class ChosenVertex(MovingVertex):
     ):
         vicinity = Vicinity.of(first.pi, glass)
         chain = Chain(scene, vicinity)
-        found = []
 
         def follow(log):
             def note(vertex, numbers, onwards, active):
@@ -360,20 +360,24 @@ class ChosenVertex(MovingVertex):
                     log.arrive(vertex.depth + 1, onwards, active)
 
             random = sampler if log is not None else sampler.clone()
-            found[:] = choose_vertex(scene, random, first, depths, vicinity, first.pi.is_valid(), note)
-            return found[0].depth
+            return choose_vertex(scene, random, first, depths, vicinity, first.pi.is_valid(), note)
 
-        log, _ = written(scene, first.ray, 1, depths, follow)
-        vertex, active, since, self.density = found
+        log, chosen = written(scene, first.ray, 1, depths, follow, lambda chosen: chosen[0].depth)
+        vertex, active, since, self.density = chosen
         super().__init__(chain, ray, first, log, vertex, active, since, mode)
 
 
 def written(
-    scene: mi.Scene, like: mi.Ray3f, first: int, depths: Depths, follow: Callable[[Log | None], mi.UInt32]
-) -> tuple[Log, mi.UInt32]:
+    scene: mi.Scene,
+    like: mi.Ray3f,
+    first: int,
+    depths: Depths,
+    follow: Callable[[Log | None], Any],
+    last_of: Callable[[Any], mi.UInt32],
+) -> tuple[Log, Any]:
     """Paths, written down from their vertex number `first` on; and what `follow` returns, which goes along them.
 
-    like : see `Log`.
+    like : see `Log`. last_of : number of the last vertex of each path, by what `follow` returns.
 
     Raises
     ------
@@ -385,9 +389,9 @@ def written(
             raise RuntimeError(
                 f'a frozen function cannot count the vertices of paths: set "max_depth" to at most {LONG}'
             )
-        last = 2 + int(dr.max(follow(None))[0])
+        last = 2 + int(dr.max(last_of(follow(None)))[0])
     log = Log(scene, like, first, last)
-    reached = follow(log)
-    dr.eval(reached)
+    found = follow(log)
+    dr.eval(last_of(found))
     log.close()
-    return log, reached
+    return log, found

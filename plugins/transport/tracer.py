@@ -161,6 +161,24 @@ class PathTracer:
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
         return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline, lune, self.lights)[0]
 
+    def arriving(
+        self, vertex: Vertex, sampler: mi.Sampler, active: mi.Bool, beside_outline: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Bool]:
+        """Light along the ray to a vertex of which a perfect mirror, or the camera, knows: without its β, detached; and
+        does the path meet, there or farther on, a surface that it does not go through?
+
+        beside_outline : see `scattered`.
+        """
+        si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
+        shines = active & ((vertex.depth > 1) | (not self.hide_emitters))
+        emitted = si.emitter(self.scene).eval(si, shines)
+        one = dr.full(mi.Spectrum, 1, dr.width(active))
+        start = Vertex(vertex.ray, vertex.pi, vertex.depth, one, mi.Float(1), vertex.mirrored, vertex.slides)
+        scattered, stopped = scattered_light(
+            self.scene, sampler, start, self.depths, active, beside_outline, None, self.lights
+        )
+        return dr.select(shines, emitted, 0) + scattered, stopped
+
 
 def camera_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Vertex:
     """The first vertex of a path, which a camera ray meets."""

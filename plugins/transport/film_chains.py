@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.geometry.texture_lines import TextureLines
 from rimlight.edge_sampling.rays import spawn_ray
 
 from .log import Log
@@ -58,10 +59,15 @@ class RayDerivative:
 
 def normal_derivative(si: mi.SurfaceInteraction3f, moved: mi.Vector3f) -> mi.Vector3f:
     """By how much the shading normal changes, where the point moves by so much."""
+    duv = uv_derivative(si, moved)
+    return duv.x * si.dn_du + duv.y * si.dn_dv
+
+
+def uv_derivative(si: mi.SurfaceInteraction3f, moved: mi.Vector3f) -> mi.Vector2f:
+    """By how much the texture coordinates change, where the point moves by so much."""
     uu, vv, uv = dr.squared_norm(si.dp_du), dr.squared_norm(si.dp_dv), dr.dot(si.dp_du, si.dp_dv)
     a, b, det = dr.dot(moved, si.dp_du), dr.dot(moved, si.dp_dv), uu * vv - uv * uv
-    inverse = dr.select(det > 0, dr.rcp(det), 0)
-    return inverse * ((vv * a - uv * b) * si.dn_du + (uu * b - uv * a) * si.dn_dv)
+    return mi.Vector2f(vv * a - uv * b, uu * b - uv * a) * dr.select(det > 0, dr.rcp(det), 0)
 
 
 class FilmRays:
@@ -98,10 +104,12 @@ class Seen:
     way : mi.UInt32, equal for chains that take the same way.
     p, n : mi.Vector3f, the point and its shading normal; of rays that meet nothing, the direction, and 0.
     moved, turned : mi.Float, how much p and n change per pixel.
+    cells : mi.UInt32, equal for chains that meet equal parts of textures.
     shown : mi.Bool, by a mirror, or by glass that bends rays?
     """
 
     way: mi.UInt32
+    cells: mi.UInt32
     p: mi.Vector3f
     n: mi.Vector3f
     moved: mi.Float
@@ -113,8 +121,9 @@ class Seen:
         return dr.zeros(Seen, width)
 
     def differs(self, other: Seen, distance: mi.Float) -> mi.Bool:
-        """Does something jump between two chains, so many pixels apart?"""
-        return (self.shown | other.shown) & ((self.way != other.way) | self.is_apart_from(other, distance))
+        """Does something jump between two chains, so many pixels apart, that is no edge as the camera sees it?"""
+        elsewhere, shown = self.way != other.way, self.shown | other.shown
+        return (shown & (elsewhere | self.is_apart_from(other, distance))) | (~elsewhere & (self.cells != other.cells))
 
     def is_apart_from(self, other: Seen, distance: mi.Float) -> mi.Bool:
         """Is there a gap, or a crease, between two points that are seen so many pixels apart?"""
@@ -125,13 +134,57 @@ class Seen:
 
 
 @dataclass
+class Segment:
+    """A segment of the film, at whose ends different things are seen.
+
+    start : mi.Point2f, pixels. length : mi.Float, pixels, along `axis`.
+    a, b : what is seen at both ends.
+    choice : mi.UInt32, of the chains.
+    weight : mi.Float, over the density with which one of its length starts here; 0: there is none.
+    """
+
+    start: mi.Point2f
+    length: mi.Float
+    axis: mi.Vector2f
+    a: Seen
+    b: Seen
+    choice: mi.UInt32
+    weight: mi.Float
+
+    @property
+    def end(self) -> mi.Point2f:
+        return self.start + self.length * self.axis
+
+    @property
+    def middle(self) -> mi.Point2f:
+        return self.start + 0.5 * self.length * self.axis
+
+    def half(self, middle: Seen, sampler: mi.Sampler) -> Segment:
+        """One of its halves in which something jumps: any of two, with twice the weight."""
+        h = 0.5 * self.length
+        left, right = self.a.differs(middle, h), middle.differs(self.b, h)
+        both = left & right
+        right &= ~left | (sampler.next_1d() < 0.5)
+        return Segment(
+            dr.select(right, self.middle, self.start),
+            h,
+            self.axis,
+            dr.select(right, middle, self.a),
+            dr.select(right, self.b, middle),
+            self.choice,
+            self.weight * dr.select(both, 2, dr.select(left | right, mi.Float(1), 0)),
+        )
+
+
+@dataclass
 class Link:
     """A vertex of a chain, and how that goes on.
 
     seen : of this vertex alone; its way is the shape.
     onwards : the next ray, and what that meets.
     ways : derivatives of the next ray.
-    lobe : mi.UInt32, 0 if there is no next vertex, 1 if the next ray has the same direction, 2 otherwise.
+    lobe : mi.UInt32, 0 if there is no next vertex, 1 if the next ray has the same direction, 2 if it is reflected, 3
+        if it is refracted.
     numbers : random numbers.
     """
 
@@ -148,21 +201,26 @@ class Parting:
 
     a, b : the vertices at which they do: what the same ray of both meets.
     along, across : derivatives of the ray to a.
-    found : mi.Bool, do they, behind a mirror?
+    on_texture : mi.Bool, is it at a line of a texture?
+    found : mi.Bool, do they, in a way that is no edge as the camera sees it?
     """
 
     a: Vertex
     b: Vertex
     along: RayDerivative
     across: RayDerivative
+    on_texture: mi.Bool
     found: mi.Bool
 
 
 class Chains:
-    """Follows chains of mirrors from the camera."""
+    """Follows chains of mirrors from the camera.
 
-    def __init__(self, tracer: PathTracer, rays: FilmRays):
-        self.tracer, self.rays = tracer, rays
+    mirrors : are there any? textures : whose lines count; None: none.
+    """
+
+    def __init__(self, tracer: PathTracer, rays: FilmRays, mirrors: bool, textures: TextureLines | None):
+        self.tracer, self.rays, self.mirrors, self.textures = tracer, rays, mirrors, textures
 
     def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:
         """What the camera sees at u."""
@@ -179,14 +237,15 @@ class Chains:
         met = active & pi.is_valid()
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, met)
         numbers = Numbers(mi.Point2f(0), mi.sample_tea_float32(choice, vertex.depth), mi.Point2f(0.5))
-        goes_on = met & self.tracer.scatters(vertex.depth)
+        goes_on = met & self.tracer.scatters(vertex.depth) & self.mirrors
         bs, weight = si.bsdf(ray).sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, goes_on)
         mirrored, through = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
         goes_on &= mirrored & dr.any(weight != 0)
         next_ray = spawn_ray(scene, si, si.to_world(bs.wo))
         next_pi = scene.ray_intersect_preliminary(next_ray, active=goes_on)
         onwards = Next(next_ray, next_pi, weight, bs.eta, goes_on & through, mirrored, mirrored)
-        lobe = dr.select(goes_on, dr.select(through, mi.UInt32(1), 2), 0)
+        reflected = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)
+        lobe = dr.select(goes_on, dr.select(through, mi.UInt32(1), dr.select(reflected, mi.UInt32(2), 3)), 0)
         at = ways[0].at(ray, si)
         beyond = tuple(
             dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
@@ -194,6 +253,7 @@ class Chains:
         shape = dr.reinterpret_array(mi.UInt32, pi.shape) ^ (dr.reinterpret_array(mi.UInt32, pi.instance) << 16)
         seen = Seen(
             dr.select(met, shape, 0),
+            dr.select(met, self.textures.cell(pi.shape, si.uv), 0) if self.textures is not None else mi.UInt32(0),
             dr.select(met, mi.Vector3f(si.p), ray.d),
             dr.select(met, mi.Vector3f(si.sh_frame.n), 0),
             dr.norm(dr.select(met, at, ways[0].d)),
@@ -211,11 +271,12 @@ class Chains:
         def step(vertex, derivative, seen, active):
             link = self.link(vertex, (derivative,), choice, active)
             found = link.seen
-            found.way = _mixed(seen.way, 4 * found.way + link.lobe)
+            found.way = mi.sample_tea_32(seen.way, 4 * found.way + link.lobe)[0]
+            found.cells = mi.sample_tea_32(seen.cells, found.cells)[0]
             found.shown = mi.Bool(seen.shown)
             goes_on = active & (link.lobe > 0)
             found = dr.select(active, found, seen)
-            found.shown |= active & (link.lobe == 2)
+            found.shown |= active & (link.lobe >= 2)
             return after(vertex, link), link.ways[0], found, goes_on
 
         state = (self.first(u, active), self.rays.derivative(u, axis), Seen.nothing(dr.width(u)), active)
@@ -224,43 +285,44 @@ class Chains:
     def part(
         self,
         first: tuple[Vertex, Vertex],
-        u: tuple[mi.Point2f, mi.Point2f],
-        axis: mi.Vector2f,
-        choice: mi.UInt32,
+        segment: Segment,
         active: mi.Bool,
         log: Log | None,
     ) -> Parting:
-        """Where two chains part that start close to each other.
+        """Where the two chains part that start at the ends of a segment.
 
-        first : what the camera sees at both positions u.
+        first : what the camera sees there.
         log : where the first chain is written down; None: nowhere.
         """
-        distance = dr.norm(u[1] - u[0])
+        rays, axis, choice = self.rays, segment.axis, segment.choice
         aside = mi.Vector2f(axis.y, axis.x)
-        rays = self.rays
 
-        def step(a, b, of_a, of_b, shown, found, active):
+        def step(a, b, of_a, of_b, shown, on_texture, found, active):
             here, there = self.link(a, of_a, choice, active), self.link(b, of_b, choice, active)
             same_shape = here.seen.way == there.seen.way
-            parts = ~same_shape | here.seen.is_apart_from(there.seen, distance)
-            found |= active & parts & shown
-            goes_on = active & ~parts & (here.lobe > 0) & (here.lobe == there.lobe)
+            parts = ~same_shape | here.seen.is_apart_from(there.seen, segment.length)
+            on_line = active & ~parts & (here.seen.cells != there.seen.cells)
+            on_texture |= on_line
+            found |= (active & parts & shown) | on_line
+            goes_on = active & ~parts & ~on_line & (here.lobe > 0) & (here.lobe == there.lobe)
             if log is not None:
                 log.leave(a.depth, a.β, here.numbers, goes_on)
                 log.arrive(a.depth + 1, here.onwards, goes_on)
             a, b = (dr.select(goes_on, after(v, link), v) for v, link in ((a, here), (b, there)))
             of_a = tuple(dr.select(goes_on, new, old) for new, old in zip(here.ways, of_a, strict=True))
             of_b = tuple(dr.select(goes_on, new, old) for new, old in zip(there.ways, of_b, strict=True))
-            return a, b, of_a, of_b, shown | (goes_on & (here.lobe == 2)), found, goes_on
+            return a, b, of_a, of_b, shown | (goes_on & (here.lobe >= 2)), on_texture, found, goes_on
 
         if log is not None:
             log.arrive(first[0].depth, first[0], active)
         no = dr.full(mi.Bool, False, dr.width(active))
-        of_a = rays.derivative(u[0], axis), rays.derivative(u[0], aside)
-        of_b = (rays.derivative(u[1], axis),)
-        state = (*first, of_a, of_b, no, mi.Bool(no), mi.Bool(active))
-        a, b, of_a, _, _, found, _ = dr.while_loop(state, lambda *state: state[-1], step, label="chains of mirrors")
-        return Parting(a, b, *of_a, found)
+        of_a = rays.derivative(segment.start, axis), rays.derivative(segment.start, aside)
+        of_b = (rays.derivative(segment.end, axis),)
+        state = (*first, of_a, of_b, no, mi.Bool(no), mi.Bool(no), mi.Bool(active))
+        a, b, of_a, _, _, on_texture, found, _ = dr.while_loop(
+            state, lambda *state: state[-1], step, label="chains of mirrors"
+        )
+        return Parting(a, b, *of_a, on_texture, found)
 
 
 def after(vertex: Vertex, link: Link) -> Vertex:
@@ -269,6 +331,3 @@ def after(vertex: Vertex, link: Link) -> Vertex:
     β, η = vertex.β * onwards.weight, vertex.η * onwards.η
     return Vertex(mi.Ray3f(onwards.ray), onwards.pi, vertex.depth + 1, β, η, onwards.mirrored, onwards.slides)
 
-
-def _mixed(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
-    return mi.sample_tea_32(a, b, 2)[0]

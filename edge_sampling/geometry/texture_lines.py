@@ -1,0 +1,141 @@
+"""Lines at which textures jump: checkerboards, bitmaps with the `nearest` filter, the slopes of bump maps.
+
+They are the lines of a lattice: a texture jumps where a component of A·(u, v, 1) is whole, with a matrix A of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .meshes import Geometry, has_place, is_map, objects_below, texture_coordinates
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where one texture of a shape jumps. matrix : A, (2, 3)."""
+
+    shape: Any
+    matrix: np.ndarray
+
+    def at(self, uv: mi.Point2f) -> mi.Point2f:
+        """Place in the lattice; attached, if the texture coordinates are."""
+        (a, b, c), (d, e, f) = self.matrix.tolist()
+        return mi.Point2f(a * uv.x + b * uv.y + c, d * uv.x + e * uv.y + f)
+
+    def along(self, duv: mi.Vector2f) -> mi.Vector2f:
+        """Derivative of that."""
+        (a, b, _), (d, e, _) = self.matrix.tolist()
+        return mi.Vector2f(a * duv.x + b * duv.y, d * duv.x + e * duv.y)
+
+
+class TextureLines:
+    """The lattices of the textures of shapes.
+
+    shapes : those that count.
+    """
+
+    DRJIT_STRUCT: dict = {}  # for `dr.freeze`
+
+    def __init__(self, shapes: list[Any]):
+        self.lattices = [Lattice(s, m) for s in shapes for m in _matrices(s)]
+
+    def __len__(self) -> int:
+        return len(self.lattices)
+
+    def cell(self, shape: mi.ShapePtr, uv: mi.Point2f) -> mi.UInt32:
+        """A number for the part of a surface between the lines."""
+        found = mi.UInt32(0)
+        for lattice in self.lattices:
+            at = mi.Point2i(dr.floor(lattice.at(uv)))
+            cell = mi.sample_tea_32(found ^ mi.UInt32(at.x), mi.UInt32(at.y))[0]
+            found = dr.select(shape == mi.ShapePtr(lattice.shape), cell, found)
+        return found
+
+    def between(self, shape: mi.ShapePtr, a: mi.Point2f, b: mi.Point2f) -> tuple[mi.UInt32, mi.Bool]:
+        """The line between two places on a surface that are next to each other: of which lattice, and is it one of the
+        second component?"""
+        which, second = mi.UInt32(0), mi.Bool(False)
+        for i, lattice in enumerate(self.lattices):
+            p, q = dr.floor(lattice.at(a)), dr.floor(lattice.at(b))
+            mine = (shape == mi.ShapePtr(lattice.shape)) & ((p.x != q.x) | (p.y != q.y))
+            which, second = dr.select(mine, mi.UInt32(i), which), dr.select(mine, p.x == q.x, second)
+        return which, second
+
+    def across(self, line: tuple[mi.UInt32, mi.Bool], vector: mi.Vector2f) -> mi.Float:
+        """Component across a line, in units of the lattice, of a derivative of texture coordinates."""
+        which, second = line
+        found = mi.Float(0)
+        for i, lattice in enumerate(self.lattices):
+            along = lattice.along(vector)
+            found = dr.select(which == i, dr.select(second, along.y, along.x), found)
+        return found
+
+
+def _matrices(shape: Any) -> list[np.ndarray]:
+    """Of the textures of a shape that jump."""
+    of_mesh = shape.is_mesh() and shape.has_vertex_texcoords()
+    uv = np.concatenate([[[0, 0], [1, 1]], texture_coordinates(shape) if of_mesh else np.zeros((0, 2))])
+    found = []
+    below = objects_below(shape)
+    bumps = [below.get(f"{name}.nested_texture") for name, o in below.items() if o.class_name() == "BumpMap"]
+    for o in below.values():
+        if not has_place(o):
+            continue
+        to_uv = np.array(mi.traverse(o)["to_uv"].matrix, float)[:2]
+        size = np.array(o.resolution() if o.class_name().startswith("Bitmap") else (2, 2), float)
+        matrix = size[:, None] * to_uv
+        if any(o is t for t in bumps):
+            found.append(matrix - [[0, 0, 0.5], [0, 0, 0.5]])  # slopes jump in the middle of texels
+        elif _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()):
+            found.append(matrix)
+    return found
+
+
+def jumping_textures(scene: mi.Scene) -> list[str]:
+    """Names of what jumps inside of faces: checkerboards, bitmaps with the `nearest` filter, and bump maps (where a
+    bitmap is continuous, its slope jumps at every texel)."""
+    uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if m.has_vertex_texcoords()]
+    uv = np.concatenate([[[0, 0], [1, 1]], *uv])
+    return [
+        f'"{name}" ({o.class_name().partition("TextureImpl")[0]})'
+        for name, o in objects_below(scene).items()
+        if (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
+        or (has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))
+    ]
+
+
+def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 256, steps: int = 22) -> bool:
+    """Bisect random segments towards their steeper half: where a texture is continuous, the difference dies out.
+
+    lower, upper : of the texture coordinates.
+    """
+    with dr.suspend_grad():
+        rng = mi.PCG32(size=pairs)
+        si = dr.zeros(mi.SurfaceInteraction3f, pairs)
+        if mi.is_spectral:
+            si.wavelengths = type(si.wavelengths)(550)
+
+        def value(uv: mi.Point2f) -> mi.Spectrum:
+            si.uv = uv
+            return texture.eval(si)
+
+        difference = lambda f, g: dr.max(dr.abs(f - g))
+        point = lambda: dr.lerp(
+            mi.Point2f(lower), mi.Point2f(upper), mi.Point2f(rng.next_float32(), rng.next_float32())
+        )
+        p, q = point(), point()
+        at_p, at_q = value(p), value(q)
+        before = difference(at_p, at_q)
+        for _ in range(steps):
+            middle = 0.5 * (p + q)
+            at_middle = value(middle)
+            left = difference(at_p, at_middle) > difference(at_middle, at_q)
+            p, at_p = dr.select(left, p, middle), dr.select(left, at_p, at_middle)
+            q, at_q = dr.select(left, middle, q), dr.select(left, at_middle, at_q)
+        # Rounding makes differences, too, where a texture is constant.
+        return bool(dr.any((before > 1e-3 * dr.max(before)) & (difference(at_p, at_q) > 0.3 * before)))

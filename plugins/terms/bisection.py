@@ -1,0 +1,226 @@
+"""What jumps on the film, but where no projection tells: outlines in perfect mirrors and glass, and textures, as a term.
+
+It is looked for. Along a short segment of the film, what is seen is compared at both ends, and where it differs, the
+segment is bisected. How the jump moves follows from a function that vanishes there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight._plan import PlannedTerm
+from rimlight.edge_sampling import FilmPart
+from rimlight.edge_sampling.boundaries.touch import touch_outline
+from rimlight.edge_sampling.geometry.texture_lines import TextureLines
+from rimlight.edge_sampling.parametrisation import Vicinity
+from rimlight.edge_sampling.projection.sensors import frame, inside_frame
+from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment, uv_derivative
+from rimlight.transport.replay import Chain, MovingVertex, written
+
+from .sampling import in_a_row, seed_of
+from .term import FilmSamples, Job, Sample, Term
+
+#: Segments of the film among which one is chosen whose ends differ.
+CANDIDATES = 8
+
+#: Length of the segments, pixels; and to which they are bisected.
+LONGEST, SHORTEST = 1.0, 2.0**-9
+
+#: Part of the segments that are looked at for jumps of which both ends know nothing; and how often those are halved at
+#: most before.
+HIDDEN, HALVINGS = 0.25, 7
+
+#: What is looked for, in plans.
+WHAT = ("perfect mirrors or glass", "textures that jump")
+
+#: Most rays that one sample traces besides those of a path: for plans.
+RAYS = 2 * (3 * CANDIDATES + 9)
+
+
+class BisectionTerm(Term):
+    """Outlines of what the camera sees in mirrors, and through glass, and lines at which textures jump."""
+
+    name = "mirrors and textures"
+
+    def planned(self, job: Job) -> PlannedTerm:
+        count = sum(job.counts.on_line(part.sensor.film()) for part in job.parts) if self._wanted(job) else 0
+        what = [w for w, there in zip(WHAT, (job.boundaries.mirrors, job.boundaries.textures), strict=True) if there]
+        why_not = '"sppp" is 0' if what else "neither mirrors, glass nor textures with jumps, or nothing moves"
+        return self.plan(count, RAYS + 2 * job.rays_of_path, " and ".join(what), why_not)
+
+    def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
+        return [partial(self._samples, job, i, part) for i, part in enumerate(job.parts)] if self._wanted(job) else []
+
+    @staticmethod
+    def _wanted(job: Job) -> bool:
+        return (job.boundaries.mirrors or job.boundaries.textures is not None) and job.counts.film > 0
+
+    def _samples(self, job: Job, i: int, part: FilmPart) -> FilmSamples:
+        film = part.sensor.film()
+        count = job.counts.on_line(film)
+        sampler = in_a_row(job.sensor, seed_of(self.name, job.seed, i), count)
+        rays = FilmRays(part.sensor, sampler)
+        chains = Chains(job.tracer, rays, job.boundaries.mirrors, job.boundaries.textures)
+        segment = bisect(chains, find_segment(chains, film, sampler), sampler)
+        active = (segment.weight > 0) & inside_frame(segment.middle, film)
+        cut = CutRays(job.mode)
+        with dr.resume_grad():
+            ray, weight = rays.at(segment.start)
+            ray, again = cut(ray), cut(rays.at(segment.start)[0])
+        at, moving = self._where_they_part(job, chains, segment, ray, active)
+        jump, alpha = self._jump(job, at, sampler)
+        factor, g = self._motion(job, at, segment, again, moving)
+        dr.eval(jump, alpha, factor)
+        with dr.resume_grad():
+            normal_velocity = factor * (g - dr.detach(g)) * (job.weights * part.area / count)
+            value = Sample(mi.Spectrum(jump * normal_velocity * weight), mi.Float(alpha * normal_velocity))
+            cuts = (cut,) if moving is None else (moving, cut)
+            return FilmSamples(part.to_film(segment.middle), value, ray.wavelengths, 0.0, 0, cuts=cuts)
+
+    @staticmethod
+    def _where_they_part(job: Job, chains: Chains, segment: Segment, ray, active) -> tuple[Parting, MovingVertex | None]:
+        """Where the chains from the ends of a segment part; and if there are mirrors, the vertex before, as it moves."""
+        first = chains.first(segment.start, active), chains.first(segment.end, active)
+        follow = lambda log: chains.part(first, segment, active, log)
+        if not job.boundaries.mirrors:
+            return follow(None), None
+        log, at = written(job.tracer.scene, first[0].ray, 1, job.tracer.depths, follow, lambda at: at.a.depth)
+        chain = Chain(job.tracer.scene, Vicinity.of(first[0].pi))
+        behind = at.found & (at.a.depth > 1)
+        last = log.vertex(dr.maximum(at.a.depth, 2) - 1, behind)
+        one = dr.full(mi.UInt32, 1, dr.width(active))
+        return at, MovingVertex(chain, ray, first[0], log, last, behind, one, job.mode, onwards=True)
+
+    @staticmethod
+    def _jump(job: Job, at: Parting, sampler: mi.Sampler) -> tuple[mi.Spectrum, mi.Float]:
+        """Difference of radiance and alpha between the first chain and the second. Detached."""
+        jump, alpha = mi.Spectrum(0), mi.Float(0)
+        for sign, vertex, other in ((1, at.a, at.b), (-1, at.b, at.a)):
+            inside = ~at.on_texture & (vertex.pi.t <= other.pi.t)
+            L, stopped = job.tracer.arriving(vertex, sampler.clone(), at.found, inside)
+            jump += sign * L
+            alpha += sign * dr.select(stopped & (vertex.depth == 1), mi.Float(1), 0)
+        return jump * at.a.β, alpha
+
+    @staticmethod
+    def _motion(job: Job, at: Parting, segment: Segment, ray: mi.Ray3f, moving: MovingVertex | None):
+        """A function g of film position and scene that vanishes at the jump, attached to the scene; and the factor by
+        which it makes the part of the velocity that segments of this axis count, times the weight of the segment.
+
+        With the gradient ∇g over the film, the jump moves by -∇g·(∂g/∂θ) / |∇g|². Segments along both axes find it, and
+        count what is along them.
+        """
+        with dr.resume_grad():
+            o, d = ray.o, ray.d
+            if moving is not None:
+                behind = at.a.depth > 1
+                o, d = dr.select(behind, moving.p, o), dr.select(behind, moving.d, d)
+            fixed = mi.Ray3f(at.a.ray)
+            fixed.o, fixed.d = dr.replace_grad(fixed.o, o), dr.replace_grad(fixed.d, d)
+        g, along, across = mi.Float(0), mi.Float(0), mi.Float(0)
+        if job.boundaries.mirrors:
+            g, along, across = _at_outline(job.tracer.scene, at, segment, fixed)
+        if job.boundaries.textures is not None:
+            of_line = _at_line(job.boundaries.textures, at, fixed)
+            with dr.resume_grad():
+                g, along, across = (
+                    dr.select(at.on_texture, new, old) for new, old in zip(of_line, (g, along, across), strict=True)
+                )
+        total = dr.square(along) + dr.square(across)
+        return dr.select(at.found & (total > 0), -segment.weight * along / total, 0), g
+
+
+def _at_outline(scene: mi.Scene, at: Parting, segment: Segment, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """g where rays touch an outline, and its derivatives along and across the segment. ray : attached."""
+    a, b = (at.a.ray, at.a.pi), (at.b.ray, at.b.pi)
+    a_is_near = at.a.pi.t <= at.b.pi.t
+    near, far = (tuple(dr.select(a_is_near, x, y) for x, y in zip(p, q, strict=True)) for p, q in ((a, b), (b, a)))
+    active = at.found & ~at.on_texture & near[1].is_valid()
+    reach = segment.length * dr.norm(at.along.o + near[1].t * at.along.d)
+    touch = touch_outline(scene, at.a.ray, near, far, reach, active)
+    along, across = (-dr.dot(touch.n, way.o + touch.t * way.d) for way in (at.along, at.across))
+    with dr.resume_grad():
+        g = touch.moved - dr.dot(touch.n, ray.o + touch.t * ray.d)
+        return dr.select(active, g, 0), dr.select(active, along, 0), dr.select(active, across, 0)
+
+
+def _at_line(textures: TextureLines, at: Parting, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """g where rays meet a line of a texture, and its derivatives along and across the segment. ray : attached."""
+    active = at.found & at.on_texture
+    here = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, active)
+    there = at.b.pi.compute_surface_interaction(at.b.ray, mi.RayFlags.All, active)
+    line = textures.between(at.a.pi.shape, here.uv, there.uv)
+    along, across = (
+        textures.across(line, uv_derivative(here, way.at(at.a.ray, here))) for way in (at.along, at.across)
+    )
+    with dr.resume_grad():
+        uv = at.a.pi.compute_surface_interaction(ray, mi.RayFlags.All, active).uv
+        return dr.select(active, textures.across(line, mi.Vector2f(uv)), 0), along, across
+
+
+def find_segment(chains: Chains, film: mi.Film, sampler: mi.Sampler) -> Segment:
+    """Half of a segment of the film, in which something jumps: one of some candidates, in proportion to their weights.
+
+    Most candidates have different ends. The others have equal ends, but something else in their middle: so what is
+    smaller than a segment is found as well. Each jump is found in one of these ways only. With the segment halved again
+    and again, it is a candidate of the last length at which both ends are equal, or else of the first kind.
+    """
+    lower, upper = frame(film)
+    start = lower - LONGEST
+    size = upper - start
+    width = sampler.wavefront_size()
+
+    def candidate(k, kept, total, sampler):
+        at = sampler.next_2d()
+        axis = dr.select(sampler.next_1d() < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
+        hidden, level = sampler.next_1d() < HIDDEN, sampler.next_1d()
+        choice = mi.UInt32(sampler.next_1d() * 2**24)
+        halvings = dr.minimum(dr.floor(-dr.log2(dr.maximum(1 - level, 2.0**-24))), HALVINGS)
+        p = dr.exp2(-dr.minimum(halvings + 1, HALVINGS))
+        length = dr.select(hidden, LONGEST * dr.exp2(-halvings), LONGEST)
+        density = length * dr.select(hidden, HIDDEN * p, 1 - HIDDEN) / (2 * size.x * size.y)
+        yes = mi.Bool(True)
+        where = mi.Point2f(start + at * size)
+        a = chains.end(where, axis, choice, yes)
+        b = chains.end(where + length * axis, axis, choice, yes)
+        middle = chains.end(where + 0.5 * length * axis, axis, choice, yes)
+        whole = Segment(where, length, axis, a, b, choice, dr.rcp(density))
+        whole.weight = dr.select(a.differs(b, length) == hidden, 0, whole.weight)
+        found = whole.half(middle, sampler)
+        total += found.weight
+        taken = sampler.next_1d() * total < found.weight
+        return k + 1, dr.select(taken, found, kept), total, sampler
+
+    nothing = Segment(
+        dr.zeros(mi.Point2f, width),
+        dr.zeros(mi.Float, width),
+        dr.zeros(mi.Vector2f, width),
+        Seen.nothing(width),
+        Seen.nothing(width),
+        dr.zeros(mi.UInt32, width),
+        dr.zeros(mi.Float, width),
+    )
+    _, kept, total, _ = dr.while_loop(
+        (dr.zeros(mi.UInt32, width), nothing, dr.zeros(mi.Float, width), sampler),
+        lambda k, *_: k < CANDIDATES,
+        candidate,
+        label="segments of the film",
+    )
+    kept.weight = total / CANDIDATES
+    return kept
+
+
+def bisect(chains: Chains, segment: Segment, sampler: mi.Sampler) -> Segment:
+    """The jump in a segment, to a small part of a pixel."""
+
+    def step(segment, sampler):
+        middle = chains.end(segment.middle, segment.axis, segment.choice, mi.Bool(True))
+        return segment.half(middle, sampler), sampler
+
+    going = lambda segment, _: (segment.weight > 0) & (segment.length > SHORTEST)
+    return dr.while_loop((segment, sampler), going, step, label="bisection")[0]
