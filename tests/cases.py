@@ -28,6 +28,7 @@ from building import (
     scene,
 )
 from cuts import CUTS
+from mirrors import MIRRORS
 from random_scenes import ball
 from rooms import ROOMS
 
@@ -890,7 +891,10 @@ CASES = [
     Case("open_air", open_air, SIDE, 1e-2, spp=128, runs=96, integrator=prb_edge(3)),
     Case("sky_blocker", sky_blocker, BLOCKER_SIDE, 5e-2, spp=256, runs=48),
     *(Case(k, *of, spp=64, runs=12, integrator=prb_edge(4), reference_spp=4096) for k, of in ROOMS.items()),
-    *(Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096) for k, (*of, depth) in CUTS.items()),
+    *(
+        Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096)
+        for k, (*of, depth) in (CUTS | MIRRORS).items()
+    ),
 ]
 
 

@@ -1,13 +1,16 @@
-"""Edges that are seen in perfect mirrors, and through glass: what `cases.py` has of them."""
+"""What is seen in perfect mirrors and through glass, and textures that jump: what `cases.py` has of jumps that are found by
+bisection."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
 from random_scenes import ball
+from scipy.interpolate import PchipInterpolator
 
 
 def cube(centre=(0.1, 0.7, 0.1), size: float = 0.4) -> mi.Mesh:
@@ -29,10 +32,12 @@ def over_mirror() -> mi.Scene:
 def two_mirrors() -> mi.Scene:
     """A cube between two mirrors, which show each other."""
     mirror = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.9, 0.95, 0.9]}}
-    back = quad((-1.5, -0.5, 1.2), (0, 2.5, 0), (3, 0, 0.3), "back", bsdf=mirror)
-    front = quad((-1.5, -0.5, -1.2), (3, 0, 0), (0, 2.5, 0), "front", bsdf=mirror)
-    at = camera((1.9, 1.4, -0.9), (0, 0.5, 0.6))
-    return scene(sensor=at, cube=cube(), back=back, front=front, sky=constant(0.4), lamp=lamp())
+    back = quad((-2.5, -0.5, 1.2), (0, 2.5, 0), (5, 0, 0.3), "back", bsdf=mirror)
+    front = quad((-2.5, -0.5, -1.2), (5, 0, 0), (0, 2.5, 0), "front", bsdf=mirror)
+    at = camera((1.9, 1.0, -0.9), (0.2, 0.5, 0.6))
+    thing = cube()
+    lit = mesh("cube", np.array(mi.traverse(thing)["vertex_positions"]).reshape(-1, 3), CUBE_FACES, bsdf=diffuse(0.0), emitter=light(2, 1, 0.5))
+    return scene(sensor=at, cube=lit, back=back, front=front, sky=constant(0.4))
 
 
 def pane() -> mi.Scene:
@@ -44,9 +49,9 @@ def pane() -> mi.Scene:
     return scene(sensor=at, cube=cube(), pane=plate, floor=floor, sky=constant(0.5))
 
 
-def bar(centre=(0.1, 0.4, 0.8)) -> mi.Mesh:
+def bar(centre=(0.1, 0.4, 0.8), name: str = "bar") -> mi.Mesh:
     vertices = cube_vertices() * [0.12, 0.8, 0.12] + centre
-    return mesh("bar", vertices, CUBE_FACES, bsdf=diffuse(0.0), emitter=light(3, 2.5, 2))
+    return mesh(name, vertices, CUBE_FACES, bsdf=diffuse(0.0), emitter=light(3, 2.5, 2))
 
 
 def before_bar(shape: dict) -> mi.Scene:
@@ -66,12 +71,36 @@ def mirrored_ball() -> mi.Scene:
     return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), cube=cube((-0.9, 0.5, -0.6), 0.3), sky=constant(0.5))
 
 
-def faceted() -> mi.Scene:
+def smooth_mirror() -> mi.Scene:
     """A smooth-shaded mirror of few triangles."""
     vertices, _, _, faces = ball(10)
     shape = mesh("ball", 0.6 * vertices + [0, 0.4, 0.3], faces, normals=True, bsdf={"type": "conductor"})
     at = camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35)
     return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), sky=constant(0.5))
+
+
+def goblet() -> mi.Scene:
+    """A wine glass of 8,064 smooth-shaded triangles before bars that shine."""
+    outside = [(0, 0), (0.4, 0), (0.42, 0.02), (0.4, 0.05), (0.1, 0.1), (0.06, 0.2), (0.06, 0.5), (0.1, 0.58), (0.3, 0.72)]
+    outside += [(0.42, 0.95), (0.44, 1.15), (0.4, 1.4), (0.385, 1.42)]
+    inside = [(0.37, 1.4), (0.41, 1.15), (0.39, 0.96), (0.27, 0.76), (0.1, 0.66), (0, 0.64)]
+    corners = np.array([*outside, *inside])
+    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    profile = PchipInterpolator(lengths, corners)(np.linspace(0, lengths[-1], 64))
+    m = 64
+    angles = 2 * np.pi * np.arange(m) / m
+    vertices = [[r * np.cos(a), y, r * np.sin(a)] for r, y in profile[1:-1] for a in angles]
+    rows = len(profile) - 2
+    index = lambda i, j: i * m + j % m
+    quads = [(index(i, j), index(i, j + 1), index(i + 1, j), index(i + 1, j + 1)) for i in range(rows - 1) for j in range(m)]
+    faces = [f for a, b, c, d in quads for f in ((a, c, b), (b, c, d))]
+    ends = len(vertices), len(vertices) + 1
+    vertices += [[0, profile[0, 1], 0], [0, profile[-1, 1], 0]]
+    faces += [f for j in range(m) for f in ((ends[0], index(0, j), index(0, j + 1)), (ends[1], index(rows - 1, j + 1), index(rows - 1, j)))]
+    glass = mesh("glass", np.add(vertices, [0, -0.3, 0]), faces, normals=True, bsdf={"type": "dielectric"})
+    at = camera((0.3, 1.1, -3.2), (0, 0.4, 0), fov=35)
+    bars = {f"bar{i}": bar((x, 0.4, 0.9), f"bar{i}") for i, x in enumerate((-0.5, 0.15, 0.8))}
+    return scene(sensor=at, glass=glass, **bars, sky=constant(0.2))
 
 
 # ---------------------- Textures that jump ----------------------
@@ -97,7 +126,7 @@ def board(**bsdf: Any) -> mi.Scene:
     """A plate with a pattern before a floor with another one."""
     floor = {"type": "rectangle", "id": "floor", "bsdf": {"type": "diffuse", "reflectance": checkers(scale=(5, 4))}}
     floor["to_world"] = mi.ScalarTransform4f().translate([0, -0.9, 0]).rotate([1, 0, 0], -90).scale(2)
-    plate = patterned("rectangle", **bsdf)
+    plate = patterned("rectangle", at=(0.03, 0.1, 0), **bsdf)
     return scene(sensor=camera((0.6, 1.4, -3.4), (0, 0, 0)), board=plate, floor=floor, sky=constant(0.6), lamp=lamp())
 
 
@@ -129,3 +158,32 @@ def checkered_ball() -> mi.Scene:
     floor = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "mirror", bsdf={"type": "conductor"})
     at = camera((0.6, 1.9, -3.4), (0.1, 0.2, 0))
     return scene(sensor=at, ball=thing, mirror=floor, sky=constant(0.4), lamp=lamp())
+
+
+SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0.4]}
+TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
+MIRROR = {"key": "mirror.vertex_positions", "rotate": [0.6, 0.2, 1]}
+CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.4]}
+BALL = {"key": "ball.to_world", "direction": [1, 0.3, 0.4]}
+MESH = {"key": "ball.vertex_positions", "direction": [1, 0.3, 0.4]}
+BOARD = {"key": "board.to_world", "rotate": [0.3, 1, 0.2]}
+LEAF = {"key": "board.to_world", "direction": [1, 0.3, 0.4]}
+
+#: Of each case: scene, motion, step, max_depth.
+MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
+    "mirror_cube": (over_mirror, SLIDE, 2e-3, 3),
+    "mirror_turns": (over_mirror, MIRROR, 2e-3, 3),
+    "mirror_camera": (over_mirror, CAMERA, 2e-3, 2),
+    "two_mirrors": (two_mirrors, TURN, 3e-3, 4),
+    "pane": (pane, SLIDE, 2e-3, 5),
+    "glass_ball": (glass_ball, BALL, 1e-3, 6),
+    "glass_ball_camera": (glass_ball, CAMERA, 1e-3, 6),
+    "mirrored_ball": (mirrored_ball, BALL, 2e-3, 3),
+    "smooth_mirror": (smooth_mirror, MESH, 2e-3, 3),
+    "checkerboard": (checkerboard, BOARD, 2e-3, 2),
+    "checkerboard_camera": (checkerboard, CAMERA, 2e-3, 3),
+    "nearest_texels": (nearest, BOARD, 2e-3, 2),
+    "leaf": (leaf, LEAF, 2e-3, 3),
+    "bumps": (bumps, BOARD, 2e-3, 2),
+    "checkered_ball": (checkered_ball, BALL, 2e-3, 3),
+}

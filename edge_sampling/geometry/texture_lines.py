@@ -5,6 +5,7 @@ They are the lines of a lattice: a texture jumps where a component of A·(u, v, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,16 +97,23 @@ def _matrices(shape: Any) -> list[np.ndarray]:
     return found
 
 
-def jumping_textures(scene: mi.Scene) -> list[str]:
+def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
     """Names of what jumps inside of faces: checkerboards, bitmaps with the `nearest` filter, and bump maps (where a
-    bitmap is continuous, its slope jumps at every texel)."""
+    bitmap is continuous, its slope jumps at every texel).
+
+    besides : shapes whose textures are not asked for.
+    """
+    known = [o for s in besides for o in objects_below(s).values()]
     uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if m.has_vertex_texcoords()]
     uv = np.concatenate([[[0, 0], [1, 1]], *uv])
     return [
         f'"{name}" ({o.class_name().partition("TextureImpl")[0]})'
         for name, o in objects_below(scene).items()
-        if (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
-        or (has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))
+        if not any(o is k for k in known)
+        and (
+            (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
+            or (has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))
+        )
     ]
 
 

@@ -85,7 +85,7 @@ def lasting_limits(
         if depths.scatters(1):
             limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
-    return (*limits, *appearance(scene, moving), *outlines(scene, geometry, edges, moving))
+    return (*limits, *appearance(scene, moving, bisects=from_points), *outlines(scene, geometry, edges, moving))
 
 
 def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool) -> list[str]:
@@ -102,10 +102,11 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below "
             "its cutoff_angle, and a projector an image with a black border."
         )
-    if any(is_mirror(s) for s in scene.shapes()):
-        lacks = "outlines in what" if from_points or not depths.scatters(2) else "what"
+    if any(is_mirror(s) for s in scene.shapes()) and (depths.scatters(2) or not from_points):
+        lacks = "outlines in the light that perfect mirrors and glass throw on other surfaces"
+        lacks = lacks if from_points else "what perfect mirrors and glass show"
         limits.append(
-            f"the derivative lacks the motion of {lacks} perfect mirrors and glass show; "
+            f"the derivative lacks the motion of {lacks}; "
             'give them a roughness, or set "sppi" to 0 to accept this.'
         )
     through = names(s for s in scene.shapes() if lets_through(s))
@@ -124,10 +125,10 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
     return limits
 
 
-def appearance(scene: mi.Scene, moving: Moving) -> list[str]:
-    """What lacks of the jumps inside of surfaces and environments."""
+def appearance(scene: mi.Scene, moving: Moving, *, bisects: bool) -> list[str]:
+    """What lacks of the jumps inside of surfaces and environments. bisects : are textures of shapes searched for jumps?"""
     limits = []
-    textures = jumping_textures(scene)
+    textures = jumping_textures(scene, besides=scene.shapes() if bisects else ())
     if textures:
         limits.append(
             f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "

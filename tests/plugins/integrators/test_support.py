@@ -195,6 +195,10 @@ def blend() -> dict:
     return two({"type": "blendbsdf", "weight": bitmap(1), "a": cases.diffuse(0.8, 0.2, 0.2), "b": rough})
 
 
+def blend_mirror() -> dict:
+    return two({"type": "blendbsdf", "weight": 0.4, "a": cases.diffuse(0.5), "b": {"type": "conductor"}})
+
+
 CELLS = {
     "`diffuse`": Cell(lambda: two(cases.diffuse(0.6, 0.3, 0.2)), "brdf_0.reflectance.value"),
     "`roughconductor`": Cell(lambda: two(cases.conductor(0.3)), "brdf_0.alpha.value"),
@@ -225,6 +229,8 @@ CELLS = {
     ),
     "`mask` in `direct_edge`": Cell(mask, "opacity.data"),
     "`null` in `direct_edge`": Cell(bsdf("null")),
+    "`blendbsdf` with a mirror": Cell(blend_mirror),
+    "`thindielectric`": Cell(bsdf("thindielectric")),
     "`conductor`": Cell(lambda: two({"type": "conductor"}), "brdf_0.specular_reflectance.value"),
     "`dielectric`": Cell(bsdf("dielectric", specular_reflectance=0.7), "specular_reflectance.value"),
     "`plastic`": Cell(lambda: two({"type": "plastic"}), "brdf_0.diffuse_reflectance.value"),
@@ -717,11 +723,7 @@ def second_sensor(kind: str, moves: str = "") -> Message:
     return Message(things, SENSOR, moves or "second.to_world")
 
 
-def blend_mirror() -> dict:
-    return two({"type": "blendbsdf", "weight": 0.4, "a": cases.diffuse(0.5), "b": {"type": "conductor"}})
-
-
-MIRROR, THROUGH, JUMPS = "what perfect mirrors and glass show", "what shines, through", "jumps of the textures"
+THROUGH = "what shines, through"
 POLARISERS = ("polarizer", "retarder", "circular")
 
 #: By row, what is said when it moves, and when it is passed.
@@ -749,17 +751,9 @@ MESSAGES = {
     "`radiancemeter`, `distant`": [second_sensor("radiancemeter"), second_sensor("distant")],
     "`projector`": [in_lamp("projector", "the border of the beams")],
     "`sunsky`": [in_lamp("sunsky", "border of the sun")],
-    "`bumpmap`": [material(CELLS["`bumpmap`"].make, JUMPS)],
-    "`blendbsdf` with a mirror": [material(blend_mirror, MIRROR)],
     "`mask` in `prb_edge`": [material(mask, THROUGH, deep=True)],
     "`null` in `prb_edge`": [material(bsdf("null"), THROUGH, deep=True)],
-    "`conductor`": [material(bsdf("conductor"), MIRROR)],
-    "`dielectric`": [material(bsdf("dielectric"), MIRROR)],
-    "`thindielectric`": [material(bsdf("thindielectric"), MIRROR)],
-    "`plastic`": [material(bsdf("plastic"), MIRROR)],
     "`polarizer`, `retarder`, `circular` in `prb_edge`": [material(bsdf(k), THROUGH, deep=True) for k in POLARISERS],
-    "`bitmap`, `nearest`": [material(CELLS["`bitmap`, `nearest`"].make, JUMPS)],
-    "`checkerboard`": [material(CELLS["`checkerboard`"].make, JUMPS)],
 }
 #: By row, what changes, and is warned about.
 CHANGES = {
@@ -829,6 +823,33 @@ def test_parameters_that_are_warned_about(row, log, tmp_path):
         enable(scene, key)
         message.integrator().find_boundaries(scene)
         assert f'{message.text} "{key}"' in "".join(log)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "make", "text"),
+    [
+        ({"type": "prb_edge", "max_depth": 3}, bsdf("conductor"), "outlines in the light that perfect mirrors"),
+        ({"type": "prb_edge", "max_depth": 2}, bsdf("conductor"), ""),
+        ({"type": "rig"}, bsdf("conductor"), "what perfect mirrors and glass show"),
+        ({"type": "rig"}, lambda: textured({"type": "checkerboard"}), "jumps of the textures"),
+        ({"type": "direct_edge"}, lambda: textured({"type": "checkerboard"}), ""),
+    ],
+)
+def test_what_is_said_of_mirrors_and_textures(integrator, make, text, log):
+    scene = stage({"thing": sheet("thing", np.array([0, 0, 1]), make()), "lamp": lamp("point", 0)})
+    enable(scene, "thing.vertex_positions")
+    mi.load_dict(integrator).find_boundaries(scene)
+    assert text in "".join(log)
+    assert text or not log
+
+
+def test_textures_of_an_environment_are_warned_about(log):
+    pattern = textured({"type": "checkerboard"})
+    projector = {"type": "projector", "irradiance": pattern["bsdf"]["reflectance"], "to_world": at([0, 0, -4])}
+    scene = stage({"thing": sheet("thing", np.array([0, 0, 1]), cases.diffuse(0.5)), "lamp": projector})
+    enable(scene, "thing.vertex_positions")
+    mi.load_dict({"type": "direct_edge"}).find_boundaries(scene)
+    assert "jumps of the textures" in "".join(log)
 
 
 def is_checked(row: str, column: str, text: str) -> bool:
