@@ -88,6 +88,14 @@ def write_numbers(
         temporary.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
 
+def status(folder: Path) -> str | None:
+    """Of the result in a folder, as of `write_numbers`; None if there is none."""
+    try:
+        return json.loads((folder / "metadata.json").read_text("utf-8"))["status"]
+    except (OSError, ValueError, KeyError):
+        return None
+
+
 def write_pictures(folder: Path, result: Result) -> None:
     """Write ``normals.png``, 16 bits, (n + 1) / 2; ``bsdf.png``; ``mesh.ply``, a vertex at the centre of each pixel.
 

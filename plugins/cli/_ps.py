@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+import drjit as dr
 import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
@@ -25,6 +26,9 @@ from ._shared import REFUSAL
 #: Bytes of memory for each value, which is that of a pixel in an image: of reading, and of a reconstruction. Measured.
 READING, RECONSTRUCTION = 40, 125
 
+#: Of a run that has not finished.
+CHECKPOINT = "checkpoint.npz"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
@@ -33,25 +37,45 @@ class Run:
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Images, lights and a mask, in the layout of DiLiGenT."""
     out: Path
-    """Folder for the results."""
+    """Folder for the results and the checkpoint."""
+    resume: bool = False
+    """Go on from the checkpoint in that folder."""
     images: int = 0
     """Use so many of the images, evenly from their list. 0: all."""
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
+    threads: int = 0
+    """Threads of Dr.Jit. 0: as many as there are cores. With 1, equal runs have equal results, bit by bit."""
     options: Annotated[reconstruction.Options, arg(name="")] = field(default_factory=reconstruction.Options)
 
     def run(self) -> int:
-        at_least(0, images=self.images)
+        at_least(0, images=self.images, threads=self.threads)
         check_output(self.out, folder=True)
-        if (self.out / "metadata.json").exists():
-            raise InputError(f'--out: "{self.out}" holds a result already; remove it, or name another folder')
+        if self._done():
+            return 0
         use_variant(self.variant)
+        if self.threads:
+            dr.set_thread_count(self.threads)
         logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
         with expected(OSError, ValueError):
             self._check_memory()
             data, truth = dataset.read(self.folder, images=self.images), _true_depth(self.folder)
         with expected(OSError), expected(ValueError, RuntimeError, pattern=REFUSAL):
             return self._reconstruct(data, truth)
+
+    def _done(self) -> bool:
+        """Is there nothing to resume, since the run has finished? Refuses a folder that holds something else."""
+        there = (self.out / CHECKPOINT).exists()
+        if not self.resume and there:
+            raise InputError(f'--out: "{self.out}" holds a run already; add --resume, or name another folder')
+        if not self.resume and (self.out / "metadata.json").exists():
+            raise InputError(f'--out: "{self.out}" holds a result already; remove it, or name another folder')
+        if self.resume and not there:
+            if output.status(self.out) == "finished":
+                print(f"finished already: {self.out / 'report.html'}")
+                return True
+            raise InputError(f'there is no checkpoint in "{self.out}" to resume from; leave out --resume')
+        return False
 
     def _check_memory(self) -> None:
         pixels, images = dataset.extent(self.folder)
@@ -77,16 +101,25 @@ class Run:
         status = "finished"
         try:
             with _listening() as stopped:
-                found = reconstruction.reconstruct(data, self.options, progress=sys.stderr.isatty(), after=after)
+                found = reconstruction.reconstruct(
+                    data,
+                    self.options,
+                    progress=sys.stderr.isatty(),
+                    after=after,
+                    checkpoint=self.out / CHECKPOINT,
+                    resume=self.resume,
+                )
         except KeyboardInterrupt:
             if found is None:
                 raise
             status = "interrupted"
-            print("rimlight: interrupted; writing what was found", file=sys.stderr)
+            print("rimlight: interrupted; writing the best that was found; --resume goes on", file=sys.stderr)
         output.write_numbers(self.out, found, self.options, status=status, truth=truth)
         output.write_pictures(self.out, found)
         title = f"Photometric stereo: {self.folder.resolve().name}"
         report.write(self.out, found, self.options, title=title, status=status, truth=truth)
+        if status == "finished":
+            (self.out / CHECKPOINT).unlink(missing_ok=True)
         print(f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s")
         print(f"report: {self.out / 'report.html'}")
         if (error := output.error_of_depth(found, truth)) is not None:

@@ -303,7 +303,7 @@ def test_interruption(folder, tmp_path, monkeypatch, capfd, alternations):
 
     def interrupted(*arguments):
         calls.append({path.name for path in out.iterdir()} if out.exists() else set())
-        if len(calls) == alternations + 1:
+        if len(calls) == 2 * alternations + 1:  # of the start; then of the state that each makes
             raise KeyboardInterrupt
         return update(*arguments)
 
@@ -312,10 +312,10 @@ def test_interruption(folder, tmp_path, monkeypatch, capfd, alternations):
     captured = capfd.readouterr()
     if not alternations:
         assert captured.err.splitlines()[-1] == "rimlight: interrupted"
-        assert not out.exists()
+        assert {path.name for path in out.iterdir()} == {_ps.CHECKPOINT}
         return
-    assert calls[1] == FILES
-    assert {path.name for path in out.iterdir()} == FILES | PICTURES
+    assert calls[2] == FILES | {_ps.CHECKPOINT}
+    assert {path.name for path in out.iterdir()} == FILES | PICTURES | {_ps.CHECKPOINT}
     metadata = json.loads((out / "metadata.json").read_text("utf-8"))
     assert metadata["status"] == "interrupted"
     assert len(metadata["history"]) == 1
