@@ -17,14 +17,21 @@ import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from rimlight.exr import read_exr
-from rimlight.inverse.photometric_stereo import calibration, dataset, output, reconstruction, report, simulation
+from rimlight.inverse.photometric_stereo import (
+    calibration,
+    cost,
+    dataset,
+    inspection,
+    inspection_page,
+    output,
+    reconstruction,
+    report,
+    simulation,
+)
 from rimlight.loading import InputError, expected, use_variant
 
 from ._loading import at_least, check_output
 from ._shared import REFUSAL
-
-#: Bytes of memory for each value, which is that of a pixel in an image: of reading, and of a reconstruction. Measured.
-READING, RECONSTRUCTION = 40, 125
 
 #: Of a run that has not finished.
 CHECKPOINT = "checkpoint.npz"
@@ -79,12 +86,11 @@ class Run:
 
     def _check_memory(self) -> None:
         pixels, images = dataset.extent(self.folder)
-        values = pixels * (min(images, self.images) if self.images else images)
-        finest = max(self.options.resolutions)
-        needed = values * (READING + RECONSTRUCTION * finest**2)
-        if (there := _available_memory()) is not None and needed > there:
+        images = min(images, self.images) if self.images else images
+        needed = cost.memory(pixels, images, self.options)
+        if (there := cost.available_memory()) is not None and needed > there:
             raise InputError(
-                f"{values / pixels:.0f} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
+                f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
                 f"{there / 2**30:.1f} GiB are available; use fewer of the --images, or smaller --resolutions"
             )
 
@@ -172,8 +178,32 @@ class Calibrate:
         return 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Inspect:
+    """Look at a data set before it is reconstructed: write a page, and print what it is like."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Images, lights and a mask, in the layout of DiLiGenT."""
+    out: Path = Path("inspection.html")
+    """The page."""
+
+    def run(self) -> int:
+        check_output(self.out, folder=False)
+        use_variant("llvm_ad_rgb")
+        with expected(OSError), expected(ValueError, pattern=REFUSAL):
+            found = inspection.inspect(self.folder)
+            inspection_page.write(self.out, found, title=f"Data set: {self.folder.resolve().name}")
+        for name, value in inspection.table(found):
+            print(f"{name:24}{value}")
+        for text in inspection.warnings(found):
+            print(f"look at this: {text}")
+        print(f"page: {self.out}")
+        return 0
+
+
 Command = (
     Annotated[Run, subcommand("run")]
+    | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Calibrate, subcommand("calibrate")]
 )
@@ -215,13 +245,3 @@ def _true_depth(folder: Path) -> np.ndarray | None:
         return None
     layers, _ = read_exr(folder / simulation.TRUE_DEPTH)
     return next(iter(layers.values()))[..., 0]
-
-
-def _available_memory() -> int | None:
-    """Bytes, where the system tells it."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    return found[0] if found else None
