@@ -21,8 +21,9 @@ from .vectors import LUMINANCE, every
 #: Pixels that are kept of all images; and the largest width and height of small pictures.
 SAMPLED, SMALL = 5000, 96
 
-#: Values that are darker than this part of what a diffuse surface would show are taken for shadows.
-DARK = 0.25
+#: Values are taken for shadows that are darker than this part of what a diffuse surface would show; or than this one of
+#: what it would show if it faced the light.
+DARK, FACING = 0.25, 0.05
 
 #: An image is worth a warning if a part of it so large is saturated or black.
 SATURATED, BLACK = 0.02, 0.9
@@ -188,9 +189,7 @@ def warnings(found: Inspection) -> list[str]:
 def table(found: Inspection) -> list[tuple[str, str]]:
     """What, and how much."""
     H, W = found.mask.shape
-    span = lambda x, digits=1: (
-        f"{100 * x.min():.{digits}f} to {100 * x.max():.{digits}f} %, mean {100 * x.mean():.1f} %"
-    )
+    span = lambda x: f"{_percent(x.min())} to {_percent(x.max())} % of an image, mean {_percent(x.mean())} %"
     intensities = found.sample.intensities @ LUMINANCE
     spread = found.spread
     pieces = "one piece" if found.parts == 1 else f"{found.parts} pieces"
@@ -231,8 +230,9 @@ def _estimates(sample: Dataset, options: Options) -> tuple[np.ndarray, np.ndarra
     counts = np.ones(sample.values.shape[:2], np.float32)
     guess = start.guess(sample, ggx.Lobes((np.nan,), (np.nan,)), counts, options)
     values = sample.luminance / np.maximum(irradiance, 1e-30) / guess.exposures
-    expected = least_squares.predicted(least_squares.trimmed(values.astype(np.float64), directions), directions)
-    return (values <= DARK * np.maximum(expected, 0)).mean(0), guess.exposures, plane.mean_directions()
+    b = least_squares.trimmed(values.astype(np.float64), directions)
+    dark = np.maximum(DARK * least_squares.predicted(b, directions), FACING * np.linalg.norm(b, axis=1, keepdims=True))
+    return (values <= dark).mean(0), guess.exposures, plane.mean_directions()
 
 
 def _misfits(raw: np.ndarray, setup: dataset.Setup) -> tuple[float, float] | None:
@@ -276,6 +276,10 @@ def _bits(files: list[Path], raw: np.ndarray) -> str:
             depths.add(opened.read(25)[24])
     words = f"PNG, {' and '.join(map(str, sorted(depths)))} bits"
     return words + " (only 8 are used)" * (depths == {16} and encoding.of_8_bits(raw))
+
+
+def _percent(part: float) -> str:
+    return "under 0.01" if 0 < part < 1e-4 else f"{100 * part:.2g}"
 
 
 def _duration(seconds: float) -> str:

@@ -19,6 +19,9 @@ from .vectors import LUMINANCE
 #: Of lights that are fewer, each has its number in the picture; of more, every fifth.
 NUMBERED = 32
 
+#: Between the circles of that picture, degrees.
+STEP = 15.0
+
 #: Brightness of what is not in the mask.
 OUTSIDE = 0.3
 
@@ -79,8 +82,9 @@ def _lights(found: Inspection) -> str:
     for k in [k for k in range(found.images) if every == 1 or (k + 1) % every == 0]:
         text = {"fontsize": 7, "color": page.INK, "xytext": (4, 3), "textcoords": "offset points"}
         axes.annotate(str(k + 1), (around[k], found.angles[k]), **text)
-    axes.set_ylim(0, max(90.0, float(found.angles.max()) + 5))
-    axes.set_yticks([30, 60, 90], ["30°", "60°", "90°"])
+    rings = np.arange(STEP, found.angles.max() + STEP, STEP)
+    axes.set_ylim(0, rings[-1])
+    axes.set_yticks(rings, [f"{ring:.0f}°" for ring in rings])
     axes.set_xticks(np.radians([0, 90, 180, 270]), ["right", "up", "left", "down"])
     axes.tick_params(colors=page.INK, labelsize=8)
     axes.grid(alpha=0.35, color=page.INK, linewidth=0.5)
@@ -91,11 +95,13 @@ def _lights(found: Inspection) -> str:
     curves = {"stated, over their median": intensities / np.median(intensities), "correction": found.exposures}
     return f"""<section>\n<h2>Lights</h2>\n<div class="plots">
 <figure>\n<h3>Directions</h3>\n{sphere}
-<figcaption>As the camera sees them: in the middle, a light shines along its axis, at the outer circle from the side.
+<figcaption>As the camera sees them: in the middle, a light shines along its axis, further out more from the side.
 The numbers are those of the images.</figcaption></figure>
 {_plot("Intensities", curves, "")}
-</div>\n<p>The correction is the factor by which images are brighter than their light explains, estimated by a robust fit of
-a diffuse surface. With fewer than 20 images, it is not estimated.</p>\n</section>"""
+</div>
+<p>The correction is the factor by which images are brighter than their light explains, estimated by a robust fit of a
+diffuse surface. With fewer than 20 images, it is not estimated.</p>
+</section>"""
 
 
 def _images(found: Inspection) -> str:
