@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import drjit as dr
 import numpy as np
 from scipy import ndimage
 
@@ -13,7 +14,7 @@ from rimlight import ggx
 
 from . import calibration
 from .dataset import LUMINANCE, Dataset, angles
-from .direct import DirectModel, Guess
+from .direct import DirectModel, Guess, Lighting
 from .evidence import Judge, Kind
 from .rendering import Rendering
 
@@ -111,7 +112,7 @@ class Alternations:
         self.rendering = Rendering(
             self.data, self.lobes, max_depth=self.options.max_depth, several=several, base_eta=eta
         )
-        self.flat = DirectModel(self.data, self.lobes)
+        self.lighting = Lighting(self.data)
 
     @property
     def domain(self):
@@ -124,6 +125,7 @@ class Alternations:
         """Path trace a state. before : interreflections of `number` states before, of which a mean is made, in place:
         less noise, and as the surface hardly changes, hardly older."""
         options = self.options
+        dr.flush_malloc_cache()  # of the fit before
         self.rendering.update(guess, depth)
         indirect = None
         if options.max_depth > 2:
@@ -143,7 +145,7 @@ class Alternations:
 
     def _seen(self, depth: np.ndarray, indirect: np.ndarray | None) -> View:
         shown = self.options.shadows
-        seen = self.rendering.visible(self.flat) if shown else np.ones(self.judge.counts.shape, bool)
+        seen = self.rendering.visible(self.lighting) if shown else np.ones(self.judge.counts.shape, bool)
         return View(self.domain.points(depth), seen, indirect)
 
     def score(self, state: State, view: View) -> None:

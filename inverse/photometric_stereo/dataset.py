@@ -105,6 +105,12 @@ class Dataset:
         found = (pictured >= (1 - 1e-4) * pictured.max()).any(2)
         return found if CLIPPED < found.mean() < 1 - CLIPPED else np.zeros_like(found)
 
+    @functools.cached_property
+    def typical(self) -> float:
+        """Median of the values that are not black; 1 if all are."""
+        lit = self.values[self.values > 0]
+        return float(np.median(lit, overwrite_input=True)) if lit.size else 1.0
+
     @property
     def luminance(self) -> np.ndarray:
         """(P, K)"""
@@ -307,12 +313,6 @@ def write(folder: Path, data: Dataset) -> None:
     from PIL import Image
 
     Image.fromarray(data.mask.astype(np.uint8) * 255).save(folder / "mask.png")
-
-
-def extent(folder: Path) -> tuple[int, int]:
-    """Pixels of the mask, and images, of a folder, none of which is read. Raises what `read` does."""
-    images = len(read_names(folder))
-    return int(read_mask(folder / "mask.png").sum()), images
 
 
 def read_names(folder: Path) -> list[str]:

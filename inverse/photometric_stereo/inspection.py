@@ -87,7 +87,7 @@ class Inspection:
     @property
     def memory(self) -> float:
         """Bytes."""
-        return cost.memory(self.pixels, self.images, self.options)
+        return cost.memory(self.pixels, self.images, self.options, near=self.sample.near)
 
     @property
     def seconds(self) -> float:

@@ -226,7 +226,8 @@ class Reconstruction:
         now, options = self.now, self.options
         size = options.resolutions[now.level]
         level = self.data.at(size)
-        level = dataclasses.replace(level, values=level.values * np.float32(self.scale))
+        if self.scale != 1:
+            level = dataclasses.replace(level, values=level.values * np.float32(self.scale))
         counts = start.counts(self.data, level, size, options.dark)
         judge = Judge(level, self.lobes, left_out(level, options.seed), counts, options.seed, options.start)
         plan = [(now.kind, options.iterations[now.level])]
@@ -313,7 +314,7 @@ class Reconstruction:
             counts = np.ones_like(work.judge.counts)
         else:
             work.rendering.update(guess, result.depth)
-            counts = work.judge.counts * (work.rendering.visible(work.flat) if options.shadows else 1)
+            counts = work.judge.counts * (work.rendering.visible(work.lighting) if options.shadows else 1)
 
         def note(depth: np.ndarray, residual: float) -> None:
             result.depth = depth

@@ -85,9 +85,10 @@ class Run:
         return False
 
     def _check_memory(self) -> None:
-        pixels, images = dataset.extent(self.folder)
-        images = min(images, self.images) if self.images else images
-        needed = cost.memory(pixels, images, self.options)
+        setup = dataset.read_setup(self.folder, images=self.images)
+        pixels, images = int(setup.mask.sum()), len(setup.names)
+        near = setup.near or setup.away is not None
+        needed = cost.memory(pixels, images, self.options, near=near)
         if (there := cost.available_memory()) is not None and needed > there:
             raise InputError(
                 f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
