@@ -8,9 +8,9 @@ from pathlib import Path
 from .direct import SAMPLED
 from .reconstruction import SETTLED, Options
 
-#: Bytes: of the program; for each value, which is that of a pixel in an image, of reading, of a reconstruction at full
-#: size, and more of one with near lights. Measured.
-FIXED, READING, RECONSTRUCTION, NEAR = 5e8, 28, 62, 20
+#: Bytes of the program; for each value, which is that of a pixel in an image, of reading; of a reconstruction at full
+#: size, for each value and for each pixel; and more for each value with near lights. Measured.
+FIXED, READING, OF_VALUE, OF_PIXEL, NEAR = 5e8, 28, 47, 1500, 20
 
 #: Seconds of one alternation: of any; on one core, for each value; and for each of those from which it fits the BSDF.
 #: Measured.
@@ -19,8 +19,8 @@ OF_ALL, OF_VALUES, OF_BSDF = 0.5, 5e-6, 1.2e-4
 
 def memory(pixels: int, images: int, options: Options, *, near: bool = False) -> float:
     """Bytes, at most. near : have the lights positions?"""
-    finest = max(options.resolutions) ** 2
-    return FIXED + pixels * images * (READING + (RECONSTRUCTION + NEAR * near) * finest)
+    values, finest = pixels * images, max(options.resolutions) ** 2
+    return FIXED + values * READING + finest * (values * (OF_VALUE + NEAR * near) + pixels * OF_PIXEL)
 
 
 def seconds(pixels: int, images: int, options: Options, cores: int | None = None) -> float:
