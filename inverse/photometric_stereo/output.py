@@ -22,6 +22,9 @@ from .direct import bsdf_of, own
 from .integration import depth_error, mesh_of
 from .reconstruction import Options, Result
 
+#: What is written after each alternation.
+NUMBERS = ("normals.exr", "depth.exr", "albedo.exr", "base.exr", "bsdf.json", "exposures.txt", "metadata.json")
+
 #: Angles of incidence for which a BSDF is drawn, degrees.
 INCIDENCES = (0, 30, 60)
 

@@ -14,6 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from rimlight.exr import remove_left_over
 from rimlight.inverse import checkpoint
 
 from .alternation import Course, State
@@ -122,8 +123,7 @@ class Checkpoint:
         ------
         ValueError : it is damaged, or belongs to other data or options. OSError : there is none.
         """
-        for left_over in self.path.parent.glob(f".{self.path.stem}.*{self.path.suffix}"):
-            left_over.unlink()  # of a program that was killed while it wrote
+        remove_left_over(self.path)
         arrays, facts = checkpoint.load(self.path, "ps")
         self._check(facts)
         rng.bit_generator.state = facts["random"]

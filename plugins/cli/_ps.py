@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from rimlight.exr import read_exr
+from rimlight.exr import read_exr, remove_left_over
 from rimlight.inverse.photometric_stereo import (
     calibration,
     cost,
@@ -73,16 +73,20 @@ class Run:
     def _done(self) -> bool:
         """Is there nothing to resume, since the run has finished? Refuses a folder that holds something else."""
         there = (self.out / CHECKPOINT).exists()
-        if not self.resume and there:
-            raise InputError(f'--out: "{self.out}" holds a run already; add --resume, or name another folder')
-        if not self.resume and (self.out / "metadata.json").exists():
-            raise InputError(f'--out: "{self.out}" holds a result already; remove it, or name another folder')
-        if self.resume and not there:
-            if output.status(self.out) == "finished":
-                print(f"finished already: {self.out / 'report.html'}")
-                return True
+        if not self.resume:
+            if there:
+                raise InputError(f'--out: "{self.out}" holds a run already; add --resume, or name another folder')
+            if (self.out / "metadata.json").exists():
+                raise InputError(f'--out: "{self.out}" holds a result already; remove it, or name another folder')
+            return False
+        for name in output.NUMBERS:
+            remove_left_over(self.out / name)
+        if there:
+            return False
+        if output.status(self.out) != "finished":
             raise InputError(f'there is no checkpoint in "{self.out}" to resume from; leave out --resume')
-        return False
+        print(f"finished already: {self.out / 'report.html'}")
+        return True
 
     def _check_memory(self) -> None:
         setup = dataset.read_setup(self.folder, images=self.images)

@@ -86,6 +86,7 @@ def test_killed_runs_resume_bit_by_bit(folder: Path, tmp_path: Path) -> None:
     run("killed", "--resume", end="writing", last=3)
     assert len(made()["history"]) == 5 and made()["level"] == 1
     assert list((tmp_path / "killed").glob(".checkpoint.*"))  # half of one
+    (tmp_path / "killed" / ".normals.123.exr").write_text("half of another file")
     run("killed", "--resume")
     assert numbers(tmp_path / "killed") == numbers(tmp_path / "whole")
     names = {path.name for path in (tmp_path / "whole").iterdir()}
