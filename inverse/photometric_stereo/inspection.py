@@ -253,12 +253,13 @@ def _of_images(found: Inspection) -> list[str]:
         )
     if len(which := np.flatnonzero(found.black > BLACK)):
         said.append(
-            f"More than {100 * BLACK:.0f} % of {listed(which)} is black: was the lamp on? Leave such images out."
+            f"More than {100 * BLACK:.0f} % of {listed(which)} is black: was the lamp on? If not, take its line out of "
+            f"{dataset.NAMES} and of the files of the lights."
         )
     if len(which := np.flatnonzero(np.abs(np.log(found.exposures)) > np.log(OFF))):
         said.append(
             f"The exposure of {listed(which)} seems to be off what {dataset.INTENSITIES} says by more than "
-            f"{100 * (OFF - 1):.0f} %. Exposures are estimated by default: do not give --no-exposures."
+            f"{100 * (OFF - 1):.0f} %. That is estimated and put right by default: do not give --no-exposures."
         )
     return said
 
