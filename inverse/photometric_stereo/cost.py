@@ -10,7 +10,7 @@ from .reconstruction import SETTLED, Options
 
 #: Bytes of the program; for each value, which is that of a pixel in an image, of reading; of a reconstruction at full
 #: size, for each value and for each pixel; and more for each value with near lights. Measured.
-FIXED, READING, OF_VALUE, OF_PIXEL, NEAR = 5e8, 28, 47, 1500, 20
+FIXED, READING, OF_VALUE, OF_PIXEL, NEAR = 7e8, 28, 47, 1500, 20
 
 #: Seconds of one alternation: of any; on one core, for each value; and for each of those from which it fits the BSDF.
 #: Measured.
