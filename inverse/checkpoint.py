@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -29,10 +30,12 @@ def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any])
     text = json.dumps({**facts, "version": VERSION})
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **{f"array/{name}": array for name, array in arrays.items()}, facts=np.array(text))
+        file.flush()
+        os.fsync(file.fileno())
 
 
-def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and facts of a checkpoint.
+def load(path: Path, who: str = "fit") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and facts of a checkpoint. who : speaks in messages.
 
     Raises
     ------
@@ -44,9 +47,9 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             facts = json.loads(str(file["facts"]))
             arrays = {name.removeprefix("array/"): file[name] for name in file.files if name != "facts"}
     except FileNotFoundError:
-        raise FileNotFoundError(f'fit: there is no checkpoint "{path}" to resume from') from None
+        raise FileNotFoundError(f'{who}: there is no checkpoint "{path}" to resume from') from None
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f'fit: "{path}" is no checkpoint, or damaged: {error}') from None
+        raise ValueError(f'{who}: "{path}" is no checkpoint, or damaged: {error}') from None
     if facts.get("version") != VERSION:
-        raise ValueError(f'fit: "{path}" has the layout {facts.get("version")}, this program writes {VERSION}')
+        raise ValueError(f'{who}: "{path}" has the layout {facts.get("version")}, this program writes {VERSION}')
     return arrays, facts

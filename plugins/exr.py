@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,6 +46,12 @@ def replacing(path: str | Path) -> Iterator[Path]:
             raise
         raise type(error)(f"cannot write {path}: {error.strerror or error}") from None
     finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove_left_over(path: Path) -> None:
+    """Remove temporary files beside `path` of programs that were killed while they wrote it."""
+    for temporary in path.parent.glob(f".{glob.escape(path.stem)}.*{glob.escape(path.suffix)}"):
         temporary.unlink(missing_ok=True)
 
 

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import drjit as dr
 import numpy as np
 from scipy import ndimage
 
@@ -13,7 +14,7 @@ from rimlight import ggx
 
 from . import calibration
 from .dataset import LUMINANCE, Dataset, angles
-from .direct import DirectModel, Guess
+from .direct import DirectModel, Guess, Lighting
 from .evidence import Judge, Kind
 from .rendering import Rendering
 
@@ -54,6 +55,33 @@ class State:
 
 
 @dataclass
+class Course:
+    """How far alternations are, at one size and with one kind of material: all that they need to go on.
+
+    state : the newest one. most : alternations after which they end. best : of the states that were judged; None before
+    the first one was. number : of alternations that were made. worse : how many in a row were worse than the best.
+    indirect : running mean of the interreflections, (P, K, 3), or None.
+    """
+
+    state: State
+    most: int
+    best: State | None = None
+    number: int = 0
+    worse: int = 0
+    indirect: np.ndarray | None = None
+
+    @property
+    def over(self) -> bool:
+        return self.best is not None and (self.number >= self.most or self.worse == PATIENCE)
+
+    def judged(self) -> None:
+        """The newest state has been judged."""
+        self.worse = 0 if self.state.better_than(self.best) else self.worse + 1
+        if not self.worse:
+            self.best = copy.deepcopy(self.state)
+
+
+@dataclass
 class View:
     """What a state shows: points, (P, 3); which lights its surface does not hide, (P, K); and what it reflects on
     itself, (P, K, 3), or None."""
@@ -84,7 +112,7 @@ class Alternations:
         self.rendering = Rendering(
             self.data, self.lobes, max_depth=self.options.max_depth, several=several, base_eta=eta
         )
-        self.flat = DirectModel(self.data, self.lobes)
+        self.lighting = Lighting(self.data)
 
     @property
     def domain(self):
@@ -97,6 +125,7 @@ class Alternations:
         """Path trace a state. before : interreflections of `number` states before, of which a mean is made, in place:
         less noise, and as the surface hardly changes, hardly older."""
         options = self.options
+        dr.flush_malloc_cache()  # of the fit before
         self.rendering.update(guess, depth)
         indirect = None
         if options.max_depth > 2:
@@ -107,7 +136,16 @@ class Alternations:
                 indirect *= max(1 / (number + 1), AVERAGED)
                 before += indirect
                 indirect = before
-        seen = self.rendering.visible(self.flat) if options.shadows else np.ones(self.judge.counts.shape, bool)
+        return self._seen(depth, indirect)
+
+    def seen_again(self, course: Course) -> View:
+        """The view of the newest state, of which the interreflections are known."""
+        self.rendering.update(course.state.guess, course.state.depth)
+        return self._seen(course.state.depth, course.indirect)
+
+    def _seen(self, depth: np.ndarray, indirect: np.ndarray | None) -> View:
+        shown = self.options.shadows
+        seen = self.rendering.visible(self.lighting) if shown else np.ones(self.judge.counts.shape, bool)
         return View(self.domain.points(depth), seen, indirect)
 
     def score(self, state: State, view: View) -> None:
@@ -115,32 +153,34 @@ class Alternations:
             errors = self.judge.errors(state.guess, self.kind, view.points, view.seen, view.indirect)
             state.left_out, state.uncertain = float(errors.mean()), float(errors.std() / np.sqrt(len(errors)))
 
-    def run(self, start: State, most: int, record: Callable[[State, float], None], seen: View | None = None) -> State:
-        """The best of the states that at most so many alternations make, and of the first.
+    def run(self, course: Course, record: Callable[[float], None], view: View | None = None) -> State:
+        """Go on with alternations to their end, and return the best state.
 
-        record : is called with each new one and its residual. seen : the view of the first, if it is known.
+        record : is called with the residual of each new state, when that has been judged. view : of the newest state,
+        if it is known.
         """
-        state, best, view, worse = start, None, None, 0
-        state.guess = self.kind.of(state.guess, self.lobes)
-        for i in range(most + 1):
-            if seen is None:
-                seen = self.view(state.guess, state.depth, None if view is None else view.indirect, i)
-            view, seen = seen, None
-            if not (state.start and i == 0 and np.isfinite(state.left_out)):
+        state = course.state
+        if course.best is None:
+            state.guess, state.kind = self.kind.of(state.guess, self.lobes), self.kind
+            view = view or self.view(state.guess, state.depth)
+            if not (state.start and np.isfinite(state.left_out)):
                 self.score(state, view)
-            worse = 0 if state.better_than(best) else worse + 1
-            if not worse:
-                best = copy.deepcopy(state)
-            if i == most or worse == PATIENCE:
-                break
-            before = state.guess.normals
-            state = State(copy.deepcopy(state.guess), state.depth, self.kind)
+            course.judged()
+        while not course.over:
+            view = view or self.seen_again(course)
+            before = course.state.guess.normals
+            state = State(copy.deepcopy(course.state.guess), course.state.depth, self.kind)
             residual = self.fit(state.guess, view)
             state.depth = self.integrate(state.guess)
-            record(state, residual)
+            course.state, course.number = state, course.number + 1
             if angles(before, state.guess.normals).mean() < self.options.tolerance:
-                most = i + 1
-        return best
+                course.most = course.number
+            view = self.view(state.guess, state.depth, view.indirect, course.number)
+            course.indirect = view.indirect
+            self.score(state, view)
+            course.judged()
+            record(residual)
+        return course.best
 
     def fit(self, guess: Guess, view: View) -> float:
         """One alternation, in place: BSDF, normals, exposures. Returns the relative residual."""

@@ -205,12 +205,12 @@ def exposures(values: np.ndarray, predicted: np.ndarray, counts: np.ndarray, lig
     if K < FEWEST:
         return np.ones(K)
     usable = (counts > 0) & (predicted > 0.1 * np.median(predicted)) & (predicted > 0)
-    ratio = np.divide(values, predicted, out=np.full(values.shape, np.nan), where=usable)
-    known = usable.any(0)
-    known[known] = np.nanmedian(ratio[:, known], axis=0) > 0
+    # An image at a time: all of their ratios would take much memory
+    ratio = np.array([np.median(values[u, k] / predicted[u, k]) if u.any() else 0.0 for k, u in enumerate(usable.T)])
+    known = ratio > 0
     x, y = lights[known, 0], lights[known, 1]
     design = np.stack([np.ones(len(x)), x, y, x * x, y * y, x * y], 1)
-    log = np.log(np.nanmedian(ratio[:, known], axis=0))
+    log = np.log(ratio[known])
     weights = np.ones(len(log))
     for _ in range(50):
         root = np.sqrt(weights)

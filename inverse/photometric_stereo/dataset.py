@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,20 +18,14 @@ from tqdm import tqdm
 from rimlight.inverse.targets import read_picture, srgb_to_linear
 from rimlight.leds import Led, read_leds, write_leds
 
-from . import least_squares
+from .encoding import ENCODED, JUDGED, looks_encoded
 from .integration import check_camera, ray_matrix
-from .vectors import unit
-
-#: Of linear sRGB; those with which published results on DiLiGenT weigh the channels.
-LUMINANCE = np.array([0.2989, 0.5870, 0.1140], np.float32)
+from .vectors import LUMINANCE, every, unit
 
 log = logging.getLogger(__name__)
 
 #: Part of the values that may be as large as the largest one, by chance.
 CLIPPED = 1e-3
-
-#: Pixels from which `looks_encoded` judges.
-JUDGED = 2000
 
 DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
     "light_directions.txt",
@@ -110,6 +104,12 @@ class Dataset:
         pictured = self.values * self.intensities.astype(np.float32)
         found = (pictured >= (1 - 1e-4) * pictured.max()).any(2)
         return found if CLIPPED < found.mean() < 1 - CLIPPED else np.zeros_like(found)
+
+    @functools.cached_property
+    def typical(self) -> float:
+        """Median of the values that are not black; 1 if all are."""
+        lit = self.values[self.values > 0]
+        return float(np.median(lit, overwrite_input=True)) if lit.size else 1.0
 
     @property
     def luminance(self) -> np.ndarray:
@@ -217,6 +217,42 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     ValueError : a file says what cannot be; sizes or numbers do not agree. OSError : one cannot be read.
     """
     folder = Path(folder)
+    setup = read_setup(folder, images=images)
+    names, mask, intensities = setup.names, setup.mask, setup.intensities
+    values = np.empty((mask.sum(), len(names), 3), np.float32)
+    for k, name in enumerate(tqdm(names, desc="images", disable=True if len(names) < 10 else None, leave=False)):
+        values[:, k] = read_pixels(folder / name, mask) / intensities[k]
+    few = every(values, JUDGED)
+    if not setup.near and looks_encoded(few * intensities.astype(np.float32), names, setup.lights, intensities):
+        log.warning(ENCODED)
+    return setup.dataset(values, mask, _truth(folder, mask))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a folder says of its images, none of which is read: as of `Dataset`, and `away`, the distance of LEDs from
+    the object of which only the directions are given."""
+
+    names: tuple[str, ...]
+    mask: np.ndarray
+    lights: np.ndarray | tuple[Led, ...]
+    intensities: np.ndarray
+    camera: np.ndarray | None
+    distance: float | None
+    away: float | None
+
+    @property
+    def near(self) -> bool:
+        return not isinstance(self.lights, np.ndarray)
+
+    def dataset(self, values: np.ndarray, mask: np.ndarray, truth: np.ndarray | None = None) -> Dataset:
+        """Of these pixels."""
+        data = Dataset(values, mask, self.lights, self.intensities, self.camera, truth, self.names, self.distance)
+        return data if self.away is None else data.with_near_lights(self.away)
+
+
+def read_setup(folder: Path, *, images: int = 0) -> Setup:
+    """Read all of a folder but its images. images, and what is raised: as of `read`."""
     names, mask = read_names(folder), read_mask(folder / "mask.png")
     near = (folder / LEDS).is_file()
     if near:
@@ -241,36 +277,11 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
         chosen = np.arange(images) * len(names) // images
         names, intensities = [names[k] for k in chosen], intensities[chosen]
         lights = tuple(lights[k] for k in chosen) if near else lights[chosen]
-    values = np.empty((mask.sum(), len(names), 3), np.float32)
-    for k, name in enumerate(tqdm(names, desc="images", disable=True if len(names) < 10 else None, leave=False)):
-        values[:, k] = read_pixels(folder / name, mask) / intensities[k]
-    if not near and looks_encoded(values * intensities.astype(np.float32), names, lights, intensities):
-        log.warning(
-            "ps: the pictures have 8 bits, and look as if they were encoded as sRGB, but PNG is taken to be linear; "
-            "export them with 16 bits, linear, or as JPEG, which is decoded"
-        )
-    camera = read_camera(folder)
-    distance = _numbers(folder / DISTANCE, 1)[0, 0] if (folder / DISTANCE).is_file() else None
-    data = Dataset(values, mask, lights, intensities, camera, _truth(folder, mask), tuple(names), distance)
-    away = folder / LIGHT_DISTANCE
-    return data.with_near_lights(_numbers(away, 1)[0, 0]) if away.is_file() else data
-
-
-def looks_encoded(pictures: np.ndarray, names: Sequence[str], lights: np.ndarray, intensities: np.ndarray) -> bool:
-    """Do PNG of 8 bits fit a diffuse surface better if they are decoded from sRGB? pictures : (P, K, 3), as read."""
-    few = pictures[:: -(-len(pictures) // JUDGED) or 1]
-    if not len(few) or not all(name.lower().endswith(".png") for name in names) or few.max() > 1 + 1e-5:
-        return False
-    levels = few * 255
-    if np.abs(levels - np.round(levels)).max() > 1e-2:
-        return False
-
-    def residual(values: np.ndarray) -> float:
-        v = (values / intensities.astype(np.float32)) @ LUMINANCE
-        off = np.abs(least_squares.predicted(least_squares.trimmed(v, lights), lights) - v)
-        return float(np.median(off, axis=1).sum() / np.median(v, axis=1).sum())
-
-    return residual(srgb_to_linear(few)) < residual(few)
+    distance, away = (
+        float(_numbers(folder / name, 1)[0, 0]) if (folder / name).is_file() else None
+        for name in (DISTANCE, LIGHT_DISTANCE)
+    )
+    return Setup(tuple(names), mask, lights, intensities, read_camera(folder), distance, away)
 
 
 def write(folder: Path, data: Dataset) -> None:
@@ -302,12 +313,6 @@ def write(folder: Path, data: Dataset) -> None:
     from PIL import Image
 
     Image.fromarray(data.mask.astype(np.uint8) * 255).save(folder / "mask.png")
-
-
-def extent(folder: Path) -> tuple[int, int]:
-    """Pixels of the mask, and images, of a folder, none of which is read. Raises what `read` does."""
-    images = len(read_names(folder))
-    return int(read_mask(folder / "mask.png").sum()), images
 
 
 def read_names(folder: Path) -> list[str]:

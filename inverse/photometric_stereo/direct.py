@@ -59,43 +59,16 @@ class Guess:
         return replace(self, normals=self.normals[pixels], albedo=self.albedo[pixels], base=base)
 
 
-class DirectModel:
-    """The model above for a data set, at given positions.
+class Lighting:
+    """The lights of a data set, at infinity or near."""
 
-    points : (P, 3), in the unit of the LEDs, or with lights at infinity in any; None for these and an orthographic
-        camera.
-    counts : (P, K): how much each value counts, in [0, 1].
-    indirect : (P, K, 3), or None.
-    """
-
-    def __init__(
-        self,
-        data: Dataset,
-        lobes: ggx.Lobes,
-        *,
-        points: np.ndarray | None = None,
-        counts: np.ndarray | None = None,
-        indirect: np.ndarray | None = None,
-    ):
+    def __init__(self, data: Dataset):
         self.P, self.K, _ = data.values.shape
-        self.lobes, self.near = lobes, data.near
-        lit = data.values[data.values > 0]
-        self.scale = float(np.median(lit)) if lit.size else 1.0
-        self.values = own(data.values)
-        self.counts = own(np.ones((self.P, self.K)) if counts is None else counts)
-        self.indirect = None if indirect is None else own(indirect)
-        self.points = own(np.zeros((self.P, 3)) if points is None else points)
-        self.perspective = data.camera is not None
+        self.near = data.near
         if data.near:
             self.lights = own(np.array([[*led.position, *led.axis, led.mu] for led in data.lights]))
         else:
             self.lights = own(data.lights)
-
-    # ---------------------- The model ----------------------
-
-    def view(self, point: mi.Point3f) -> mi.Vector3f:
-        """Unit directions from points towards the camera."""
-        return -dr.normalize(mi.Vector3f(point)) if self.perspective else mi.Vector3f(0, 0, 1)
 
     def light(self, k: mi.UInt32, point: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
         """Unit directions from points towards lights, and irradiance of a surface that faces them, for an intensity
@@ -115,6 +88,39 @@ class DirectModel:
 
     def _of_led(self, k: mi.UInt32, first: int) -> mi.Vector3f:
         return mi.Vector3f(*(dr.gather(mi.Float, self.lights, 7 * k + first + i) for i in range(3)))
+
+
+class DirectModel(Lighting):
+    """The model above for a data set, at given positions.
+
+    points : (P, 3), in the unit of the LEDs, or with lights at infinity in any; None for these and an orthographic
+        camera.
+    counts : (P, K): how much each value counts, in [0, 1].
+    indirect : (P, K, 3), or None.
+    """
+
+    def __init__(
+        self,
+        data: Dataset,
+        lobes: ggx.Lobes,
+        *,
+        points: np.ndarray | None = None,
+        counts: np.ndarray | None = None,
+        indirect: np.ndarray | None = None,
+    ):
+        super().__init__(data)
+        self.lobes, self.scale = lobes, data.typical
+        self.values = own(data.values)
+        self.counts = own(np.ones((self.P, self.K), np.float32) if counts is None else counts)
+        self.indirect = None if indirect is None else own(indirect)
+        self.points = own(np.zeros((self.P, 3)) if points is None else points)
+        self.perspective = data.camera is not None
+
+    # ---------------------- The model ----------------------
+
+    def view(self, point: mi.Point3f) -> mi.Vector3f:
+        """Unit directions from points towards the camera."""
+        return -dr.normalize(mi.Vector3f(point)) if self.perspective else mi.Vector3f(0, 0, 1)
 
     def mean_directions(self) -> np.ndarray:
         """Towards the lights, from the middle of the surface: (K, 3)."""

@@ -16,6 +16,9 @@ FEWEST, SPREAD = 4, 0.05
 #: Directions whose third singular value is less than this part of the first are taken to lie in a plane.
 PLANE = 1e-3
 
+#: Pixels that are treated at a time, for memory.
+BLOCK = 2**14
+
 #: Iterations of reweighted least squares, and the part of a pixel's mean size below which residuals count as small.
 ITERATIONS, SMALL = 30, 1e-3
 
@@ -40,10 +43,14 @@ def ranks(values: np.ndarray) -> np.ndarray:
 def trimmed(values: np.ndarray, lights: np.ndarray, low: float = 0.2, high: float = 0.8) -> np.ndarray:
     """Least squares without the darkest and the brightest values of each pixel, where what is left tells all three
     numbers: (P, 3)."""
-    rank = ranks(values)
-    kept = (rank >= low) & (rank <= high)
-    kept |= ~telling(kept, lights)[:, None]
-    return least_squares(values, lights, kept.astype(values.dtype))
+    found = np.empty((len(values), 3))
+    for i in range(0, len(values), BLOCK):
+        part, of_part = values[i : i + BLOCK], lights if lights.ndim == 2 else lights[i : i + BLOCK]
+        rank = ranks(part)
+        kept = (rank >= low) & (rank <= high)
+        kept |= ~telling(kept, of_part)[:, None]
+        found[i : i + BLOCK] = least_squares(part, of_part, kept.astype(part.dtype))
+    return found
 
 
 def telling(kept: np.ndarray, lights: np.ndarray) -> np.ndarray:
@@ -60,7 +67,8 @@ def brightest(values: np.ndarray, dark: float) -> np.ndarray:
     """Which values of each pixel are not among its darkest, of which `dark` is the part: (P, K), bool. At least four of
     a pixel are left, or all."""
     last = values.shape[1] - 1
-    return ranks(values) * last >= min(dark * last, last + 1 - FEWEST) - 1e-9
+    bright = lambda part: ranks(part) * last >= min(dark * last, last + 1 - FEWEST) - 1e-9
+    return np.concatenate([bright(values[i : i + BLOCK]) for i in range(0, len(values), BLOCK)])
 
 
 def check_lights(lights: np.ndarray) -> None:

@@ -22,6 +22,9 @@ from .direct import bsdf_of, own
 from .integration import depth_error, mesh_of
 from .reconstruction import Options, Result
 
+#: What is written after each alternation.
+NUMBERS = ("normals.exr", "depth.exr", "albedo.exr", "base.exr", "bsdf.json", "exposures.txt", "metadata.json")
+
 #: Angles of incidence for which a BSDF is drawn, degrees.
 INCIDENCES = (0, 30, 60)
 
@@ -86,6 +89,14 @@ def write_numbers(
     }
     with replacing(folder / "metadata.json") as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+
+
+def status(folder: Path) -> str | None:
+    """Of the result in a folder, as of `write_numbers`; None if there is none."""
+    try:
+        return json.loads((folder / "metadata.json").read_text("utf-8"))["status"]
+    except (OSError, ValueError, KeyError):
+        return None
 
 
 def write_pictures(folder: Path, result: Result) -> None:

@@ -9,30 +9,25 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy import ndimage
 from tqdm import tqdm
 
 from rimlight import ggx
 
-from . import calibration, least_squares
-from .alternation import Alternations, State
-from .dataset import Dataset, angles, unit
-from .direct import DirectModel, Guess
+from . import least_squares, start
+from .alternation import Alternations, Course, State, View
+from .dataset import Dataset, angles
+from .direct import Guess
 from .evidence import Judge, Kind, left_out
+from .progress import Checkpoint, Progress
 from .refinement import Descent, descend
-from .rendering import Domain, Rendering
-
-log = logging.getLogger(__name__)
-
-#: Pixels without which there is no surface.
-FEWEST = 9
+from .rendering import Rendering
 
 #: Alternations of each kind of material, from the best state of the simplest: with the normals of the start, anything
 #: may look like a coat.
@@ -137,10 +132,6 @@ class Result:
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
 
-    def take(self, state: State) -> None:
-        """Take over a state of an alternation."""
-        self.guess, self.depth, self.kind = state.guess, state.depth, state.kind
-
     @property
     def normal_map(self) -> np.ndarray:
         """(H, W, 3), 0 outside the mask."""
@@ -158,188 +149,188 @@ class Result:
 
 
 def reconstruct(
-    data: Dataset, options: Options | None = None, *, progress: bool = True, after: Callable | None = None
+    data: Dataset,
+    options: Options | None = None,
+    *,
+    progress: bool = True,
+    after: Callable[[Result], None] | None = None,
+    checkpoint: Path | str | None = None,
+    resume: bool = False,
 ) -> Result:
     """Normals, depth and reflectance of a data set.
 
     Of all states, the one is returned that best predicts values that were left out. `Result.verdict` says if it is the
     start.
 
-    after : called with the result so far after each alternation.
+    after : called with the best result so far after each alternation, and with the newest after each step of descent.
+    checkpoint : file from which the reconstruction can go on, in place of which a newer one is written after
+        alternations. Writing takes at most a twentieth of the time.
+    resume : go on from that file. With one thread of Dr.Jit, the result is bit by bit that of a reconstruction which
+        was not interrupted; with several, sums differ in their last bits, in any two reconstructions alike. Descent
+        begins anew.
 
     Raises
     ------
-    ValueError : lights lie in a plane, all images are black, or the mask has hardly any pixels.
+    ValueError : lights lie in a plane, all images are black, or the mask has hardly any pixels; the checkpoint is
+        damaged, or belongs to other data or options. OSError : there is no checkpoint.
     """
-    options, begin = options or Options(), time.perf_counter()
-    lobes, _ = ggx.read_dictionary()
-    if not options.reflectance:
-        lobes = ggx.Lobes((np.nan,), (np.nan,))
-    _check(data)
-    rng = np.random.default_rng(options.seed)
-    scale = _scale(data.at(options.resolutions[0]), options)
-    result, coarse = None, 1
-    kinds = options.kinds()
-    others = SETTLED * len(kinds) if len(kinds) > 1 else 0
-    bar = tqdm(total=sum(options.iterations) + others + options.descent.steps, desc="ps", disable=not progress)
+    run = Reconstruction(data, options or Options(), after=after)
+    if checkpoint is not None:
+        run.keep(Path(checkpoint), resume=resume)
+    elif resume:
+        raise ValueError("ps: to resume, name the checkpoint")
+    return run.finish(progress)
 
-    def record(state: State, residual: float) -> None:
-        result.take(state)
-        result.seconds = time.perf_counter() - begin
-        entry = {"size": size, "seconds": result.seconds, "residual": residual}
-        if result.data.truth is not None:
-            entry["error"] = result.error
-        result.history.append(entry)
-        bar.set_postfix({k: f"{v:.3g}" for k, v in entry.items() if k != "seconds"})
-        bar.update()
-        if after is not None:
-            after(result)
 
-    for size, most in zip(options.resolutions, options.iterations, strict=True):
-        level = data.at(size)
-        level = dataclasses.replace(level, values=level.values * np.float32(scale))
-        counts = _counts(data, level, size, options.dark)
-        judge = Judge(level, lobes, left_out(level, options.seed), counts, options.seed, options.start)
-        kind = kinds[0] if result is None else result.kind
-        work = Alternations(level, lobes, kind, judge, options, rng)
-        guess = _start(level, lobes, counts, options)
-        start, seen = work.judged_start(guess, _flat(level).lighting()[0], kinds)
-        if result is None:
-            result = Result(level, lobes, guess, start.depth, work.domain, guess.normals, scale, kind)
-            first = copy.deepcopy(start)
-            if kind.several:  # which is another guess
-                seen = None
+class Reconstruction:
+    """A reconstruction under way; `now` says how far it is."""
+
+    def __init__(self, data: Dataset, options: Options, *, after: Callable[[Result], None] | None = None):
+        start.check(data)
+        self.data, self.options, self.after = data, options, after
+        self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
+        self.kinds = options.kinds()
+        self.rng = np.random.default_rng(options.seed)
+        self.scale = start.scale(data.at(options.resolutions[0]), options)
+        self.now = Progress(kind=self.kinds[0])
+        self.file: Checkpoint | None = None
+        self.work: Alternations | None = None
+
+    def keep(self, path: Path, *, resume: bool) -> None:
+        """Write checkpoints from now on. resume : go on from the one that is there."""
+        self.file = Checkpoint(path, self.data, self.options)
+        if resume:
+            self.now = self.file.load(self.rng)
         else:
-            _refine(result, level, before=coarse, now=round(1 / size))
-            first = State(result.guess, work.domain.integrate(result.guess.normals, options.bilateral), kind)
-            seen = None
-        result.data, result.domain, coarse = level, work.domain, round(1 / size)
-        best = work.run(first, most, record, seen)
-        if size == options.resolutions[0]:
-            settled = best
-            for kind in kinds if judge.able and len(kinds) > 1 else ():
-                del work
-                work = Alternations(level, lobes, kind, judge, options, rng)
-                again = dataclasses.replace(copy.deepcopy(settled), left_out=np.nan)
-                found = work.run(again, SETTLED, record)
-                if found.better_than(best) if kind == best.kind else found.needed_beside(best):
-                    best = found
-        if start.left_out < best.left_out:
-            best = start
-        result.take(best)
-        result.left_out = {"start": start.left_out, "result": best.left_out}
-    result.verdict = "start" if best.start else "judged" if judge.able else "not judged"
-    if options.descent.steps:
-        _descend(result, work, record, rng)
-    bar.close()
-    return result
+            self.file.save(self.now, self.rng)
 
+    def finish(self, progress: bool = True) -> Result:
+        options, now = self.options, self.now
+        self.before, self.began = now.seconds, time.perf_counter()
+        others = SETTLED * len(self.kinds) if len(self.kinds) > 1 else 0
+        total = sum(options.iterations) + others + options.descent.steps
+        with tqdm(total=total, initial=len(now.history), desc="ps", disable=not progress) as self.bar:
+            result: Result | None = None
+            while now.level < len(options.resolutions):
+                result = self._alternate(result)
+                now.next_level(result.kind)
+            if options.descent.steps:
+                self._descend(result)
+        return result
 
-def _counts(data: Dataset, level: Dataset, size: float, dark: float) -> np.ndarray:
-    """How much values of a level count, (P, K): 0 for the darkest of each pixel, and what is clipped, even in part."""
-    clipped = data.clipped
-    if size < 1:
-        clipped = data.blocks(round(1 / size))[1](clipped.astype(np.float32)) > 0
-    return (least_squares.brightest(level.luminance, dark) & ~clipped).astype(np.float32)
+    # ---------------------- Alternations ----------------------
 
+    def _alternate(self, coarse: Result | None) -> Result:
+        """All alternations at one size of the images. coarse : what was found at the one before; None if it is the
+        first, or some of this one are made already."""
+        now, options = self.now, self.options
+        size = options.resolutions[now.level]
+        level = self.data.at(size)
+        if self.scale != 1:
+            level = dataclasses.replace(level, values=level.values * np.float32(self.scale))
+        counts = start.counts(self.data, level, size, options.dark)
+        judge = Judge(level, self.lobes, left_out(level, options.seed), counts, options.seed, options.start)
+        plan = [(now.kind, options.iterations[now.level])]
+        if now.level == 0 and judge.able and len(self.kinds) > 1:
+            plan += [(kind, SETTLED) for kind in self.kinds]
+        for kind, most in plan[now.trial :]:
+            view, self.work = None, None  # of Dr.Jit's scenes one at a time
+            self.work = Alternations(level, self.lobes, kind, judge, options, self.rng)
+            if now.start is None:
+                view = self._begin(most, coarse)
+            elif now.course is None:
+                now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=np.nan), most)
+            now.end_trial(self.work.run(now.course, self._record, view))
+        return self._result()
 
-def _check(data: Dataset) -> None:
-    """Raises ValueError for data that tell nothing; logs what makes them tell less."""
-    if not data.near:
-        least_squares.check_lights(data.lights)
-    if not data.values.max() > 0:
-        raise ValueError("ps: all images are black in the mask; check the images, their exposure and the mask")
-    if len(data.values) < FEWEST:
-        raise ValueError(f"ps: the mask has {len(data.values)} pixels, at least {FEWEST} are needed; check mask.png")
-    if share := data.clipped.mean():
-        log.warning(
-            "ps: %.2g %% of the values are clipped: they equal the largest one, and do not count; expose less",
-            100 * share,
+    def _begin(self, most: int, coarse: Result | None) -> View | None:
+        """Judge the start of a size, and begin its alternations. Returns the view of their first state, if known."""
+        now, options, work = self.now, self.options, self.work
+        guess = start.guess(work.data, self.lobes, work.judge.counts, options)
+        now.start, view = work.judged_start(guess, start.flat(work.data).lighting()[0], self.kinds)
+        if coarse is None:
+            now.first = guess.normals
+            now.course = Course(copy.deepcopy(now.start), most)
+            return None if work.kind.several else view  # of several, the guess is another one
+        sides = [round(1 / options.resolutions[i]) for i in (now.level - 1, now.level)]
+        guess = start.refined(coarse.guess, coarse.domain, work.data, before=sides[0], now=sides[1])
+        now.course = Course(State(guess, work.integrate(guess), work.kind), most)
+        return None
+
+    def _record(self, residual: float) -> None:
+        """After each alternation."""
+        self._note(self.now.course.state.guess.normals, residual)
+        if self.file is not None:
+            self.file.save_if_due(self.now, self.rng)
+        if self.after is not None:
+            self.after(self._result())
+
+    def _note(self, normals: np.ndarray, residual: float) -> None:
+        now, level = self.now, self.work.data
+        now.seconds = self.before + time.perf_counter() - self.began
+        size = self.options.resolutions[min(now.level, len(self.options.resolutions) - 1)]
+        entry = {"size": size, "seconds": now.seconds, "residual": residual}
+        if level.truth is not None:
+            entry["error"] = float(angles(normals, level.truth).mean())
+        now.history.append(entry)
+        self.bar.set_postfix({k: f"{v:.3g}" for k, v in entry.items() if k != "seconds"})
+        self.bar.update()
+
+    def _result(self) -> Result:
+        """The best of what has been judged so far, at the present size."""
+        now, work = self.now, self.work
+        best = now.best_so_far()
+        return Result(
+            work.data,
+            self.lobes,
+            best.guess,
+            best.depth,
+            work.domain,
+            now.first,
+            self.scale,
+            best.kind,
+            verdict="start" if best.start else "judged" if work.judge.able else "not judged",
+            left_out={"start": now.start.left_out, "result": best.left_out},
+            history=now.history,
+            seconds=now.seconds,
         )
 
+    # ---------------------- Descent ----------------------
 
-def _scale(data: Dataset, options: Options) -> float:
-    """By which values are multiplied, so that albedos are those of real things."""
-    if not options.brightness:
-        return 1.0
-    directions, irradiance = _flat(data).lighting()
-    b = [least_squares.trimmed(_over(data.values[..., c], irradiance), directions) for c in range(3)]
-    return options.brightness / np.pi / max(np.median(np.linalg.norm(x, axis=1)) for x in b)
+    def _descend(self, result: Result) -> None:
+        """Steps along derivatives of path-traced images, from the best state, in place."""
+        work, options, data, guess = self.work, self.options, result.data, result.guess
+        if work.kind != result.kind or options.descent.lights:
+            several, eta = result.kind.several, result.kind.base_eta(result.lobes)
+            work.rendering = Rendering(
+                data,
+                result.lobes,
+                max_depth=options.max_depth,
+                lights=options.descent.lights,
+                several=several,
+                base_eta=eta,
+            )
+        if options.descent.depth_rate:
+            counts = np.ones_like(work.judge.counts)
+        else:
+            work.rendering.update(guess, result.depth)
+            counts = work.judge.counts * (work.rendering.visible(work.lighting) if options.shadows else 1)
 
+        def note(depth: np.ndarray, residual: float) -> None:
+            result.depth = depth
+            self._note(guess.normals, residual)
+            result.seconds = self.now.seconds
+            if self.after is not None:
+                self.after(result)
 
-def _flat(data: Dataset) -> DirectModel:
-    """Of a plane at the distance of the object, across the view."""
-    domain = Domain(data)
-    points = domain.points(np.full(domain.wide.sum(), domain.distance))
-    return DirectModel(data, ggx.Lobes((np.nan,), (np.nan,)), points=points)
-
-
-def _over(values: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
-    """Values as of lights at infinity, (P, K). 0 where a light does not shine."""
-    return np.divide(values, irradiance, out=np.zeros(values.shape), where=irradiance > 1e-6 * irradiance.max())
-
-
-def _start(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options) -> Guess:
-    """Diffuse, with exposures."""
-    flat = _flat(data)
-    directions, irradiance = flat.lighting()
-    values = _over(data.luminance, irradiance)
-    solve = least_squares.METHODS[options.start]
-    if data.clipped.any():  # what is too bright is known then, and need not be guessed
-        told = least_squares.telling(counts > 0, directions)[:, None]
-        solve = lambda values, lights: least_squares.least_squares(values, lights, np.where(told, counts, 1.0))
-    exposures = np.ones(flat.K)
-    for _ in range(3 if options.exposures else 0):
-        predicted = least_squares.predicted(solve(values / exposures, directions), directions)
-        exposures *= calibration.exposures(values / exposures, predicted, counts, flat.mean_directions())
-    found = solve((values / exposures).astype(np.float64), directions)
-    normals, albedo = least_squares.facing(found), np.linalg.norm(found, axis=1)
-    weights = np.zeros((len(lobes), 3))
-    colour = (data.values / exposures[:, None]).mean((0, 1)) / (data.luminance / exposures).mean()
-    weights[np.isnan(lobes.eta)] = np.minimum(np.pi * np.median(albedo) * colour, 1)
-    return Guess(normals, np.ones(len(values)), exposures, weights)
-
-
-def _refine(result: Result, data: Dataset, *, before: int, now: int) -> None:
-    """Take a guess to larger images. before, now : sides of their pixels, in those of the data."""
-    rows, columns = np.nonzero(data.mask)
-    domain = result.domain
-    guess = result.guess
-    pixels = np.c_[guess.normals, guess.albedo, np.empty((len(guess.albedo), 0)) if guess.base is None else guess.base]
-    padded = np.zeros((*domain.wide.shape, pixels.shape[1]))
-    padded[domain.wide] = pixels[domain.nearest]
-    _, nearest = ndimage.distance_transform_edt(~domain.wide, return_indices=True)
-    padded = padded[nearest[0], nearest[1]]
-    centre = lambda i: (now * i + (now - before) / 2) / before + 1  # the domain is larger by a pixel
-    at = [centre(rows), centre(columns)]
-    fine = [ndimage.map_coordinates(padded[..., i], at, order=1, mode="nearest") for i in range(padded.shape[2])]
-    guess.normals, guess.albedo = unit(np.stack(fine[:3], 1)), fine[3]
-    if guess.base is not None:
-        guess.base = np.stack(fine[4:], 1)
-
-
-def _descend(result: Result, work: Alternations, record: Callable, rng: np.random.Generator) -> None:
-    """Steps along derivatives of path-traced images, from the best state."""
-    options, data, guess = work.options, result.data, result.guess
-    if work.kind != result.kind or options.descent.lights:
-        several, eta = result.kind.several, result.kind.base_eta(result.lobes)
-        work.rendering = Rendering(
+        result.depth = descend(
+            work.rendering,
             data,
-            result.lobes,
-            max_depth=options.max_depth,
-            lights=options.descent.lights,
-            several=several,
-            base_eta=eta,
+            guess,
+            result.depth,
+            counts,
+            options.descent,
+            self.rng,
+            bilateral=options.bilateral,
+            after=note,
         )
-    if options.descent.depth_rate:
-        counts = np.ones_like(work.judge.counts)
-    else:
-        work.rendering.update(guess, result.depth)
-        counts = work.judge.counts * (work.rendering.visible(work.flat) if options.shadows else 1)
-
-    def note(depth: np.ndarray, residual: float) -> None:
-        record(State(guess, depth, result.kind), residual)
-
-    descend(
-        work.rendering, data, guess, result.depth, counts, options.descent, rng, bilateral=options.bilateral, after=note
-    )

@@ -12,7 +12,7 @@ from scipy import ndimage
 from rimlight import ggx, leds, no_collection
 
 from .dataset import Dataset
-from .direct import DirectModel, Guess, bsdf_of, own
+from .direct import Guess, Lighting, bsdf_of, own
 from .integration import integrate, mesh_of
 
 #: Distance of an orthographic camera from the surface, over the size of the image.
@@ -210,13 +210,20 @@ class Rendering:
 
     def image(self, *, spp: int, seed: int, max_depth: int | None = None) -> np.ndarray:
         """(P, K, 3)"""
-        return self._pixels(self.integrators[max_depth or self.max_depth].render(self.scene, seed=seed, spp=spp))
+        return self._images(spp, seed, max_depth or self.max_depth)[self.data.mask]
 
     def indirect(self, *, spp: int, seed: int) -> np.ndarray:
         """Of `image`, what has been reflected more than once: (P, K, 3). Equal seeds make the rest cancel."""
         found = self.image(spp=spp, seed=seed)
-        found -= self.image(spp=spp, seed=seed, max_depth=2)  # in place: these are the largest arrays of all
+        direct = self._images(spp, seed, 2)
+        for k in range(found.shape[1]):  # these are the largest arrays of all
+            found[:, k] -= direct[:, :, k][self.data.mask]
         return found
+
+    def _images(self, spp: int, seed: int, max_depth: int) -> np.ndarray:
+        """(H, W, K, 3), in Dr.Jit's memory."""
+        image = self.integrators[max_depth].render(self.scene, seed=seed, spp=spp)
+        return np.asarray(image).reshape(*self.data.mask.shape, -1, 3)
 
     def gradient(
         self, adjoint: np.ndarray, *, spp: int, seed: int, depth: bool = False, adaptive: bool = False
@@ -268,9 +275,9 @@ class Rendering:
         return result
 
     @no_collection()
-    def visible(self, model: DirectModel) -> np.ndarray:
+    def visible(self, lighting: Lighting) -> np.ndarray:
         """Which lights the surface does not hide from its pixels: (P, K), bool."""
-        P, K = model.P, model.K
+        P, K = lighting.P, lighting.K
         p = dr.arange(mi.UInt32, P)
         inner = dr.gather(mi.UInt32, mi.UInt32(self.domain.inner.astype(np.uint32)), p)
         load = lambda kind, name: dr.gather(kind, self.params[self.key(name)], inner)
@@ -280,14 +287,10 @@ class Rendering:
         found = dr.zeros(mi.UInt8, P * K)
 
         def body(k):
-            direction, _ = model.light(k, point)
-            hidden = self.scene.ray_test(mi.Ray3f(origin, direction, model.distance(k, point), 0.0, []))
+            direction, _ = lighting.light(k, point)
+            hidden = self.scene.ray_test(mi.Ray3f(origin, direction, lighting.distance(k, point), 0.0, []))
             dr.scatter(found, mi.UInt8(dr.select(hidden, mi.UInt32(0), mi.UInt32(1))), p * K + k)
             return (k + 1,)
 
         dr.while_loop((dr.zeros(mi.UInt32, P),), lambda k: k < K, body, label="lights")
         return np.array(found).reshape(P, K).astype(bool)
-
-    def _pixels(self, image: mi.TensorXf) -> np.ndarray:
-        H, W = self.data.mask.shape
-        return np.array(image).reshape(H, W, -1, 3)[self.data.mask]

@@ -1,11 +1,19 @@
-"""Unit vectors."""
+"""Unit vectors, and other small things that many modules need."""
 
 from __future__ import annotations
 
 import numpy as np
+
+#: Of linear sRGB; those with which published results on DiLiGenT weigh the channels.
+LUMINANCE = np.array([0.2989, 0.5870, 0.1140], np.float32)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) of length 1; those of length 0 face the camera."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), [0, 0, 1])
+
+
+def every(array: np.ndarray, most: int) -> np.ndarray:
+    """At most so many rows of an array, evenly."""
+    return array[:: -(-len(array) // most) or 1]

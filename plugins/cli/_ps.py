@@ -12,18 +12,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+import drjit as dr
 import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from rimlight.exr import read_exr
-from rimlight.inverse.photometric_stereo import calibration, dataset, output, reconstruction, report, simulation
+from rimlight.exr import read_exr, remove_left_over
+from rimlight.inverse.photometric_stereo import (
+    calibration,
+    cost,
+    dataset,
+    inspection,
+    inspection_page,
+    output,
+    reconstruction,
+    report,
+    simulation,
+)
 from rimlight.loading import InputError, expected, use_variant
 
 from ._loading import at_least, check_output
 from ._shared import REFUSAL
 
-#: Bytes of memory for each value, which is that of a pixel in an image: of reading, and of a reconstruction. Measured.
-READING, RECONSTRUCTION = 40, 125
+#: Of a run that has not finished.
+CHECKPOINT = "checkpoint.npz"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,19 +44,25 @@ class Run:
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Images, lights and a mask, in the layout of DiLiGenT."""
     out: Path
-    """Folder for the results."""
+    """Folder for the results and the checkpoint."""
+    resume: bool = False
+    """Go on from the checkpoint in that folder."""
     images: int = 0
     """Use so many of the images, evenly from their list. 0: all."""
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
+    threads: int = 0
+    """Threads of Dr.Jit. 0: as many as there are cores. With 1, equal runs have equal results, bit by bit."""
     options: Annotated[reconstruction.Options, arg(name="")] = field(default_factory=reconstruction.Options)
 
     def run(self) -> int:
-        at_least(0, images=self.images)
+        at_least(0, images=self.images, threads=self.threads)
         check_output(self.out, folder=True)
-        if (self.out / "metadata.json").exists():
-            raise InputError(f'--out: "{self.out}" holds a result already; remove it, or name another folder')
+        if self._done():
+            return 0
         use_variant(self.variant)
+        if self.threads:
+            dr.set_thread_count(self.threads)
         logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
         with expected(OSError, ValueError):
             self._check_memory()
@@ -53,14 +70,32 @@ class Run:
         with expected(OSError), expected(ValueError, RuntimeError, pattern=REFUSAL):
             return self._reconstruct(data, truth)
 
+    def _done(self) -> bool:
+        """Is there nothing to resume, since the run has finished? Refuses a folder that holds something else."""
+        there = (self.out / CHECKPOINT).exists()
+        if not self.resume:
+            if there:
+                raise InputError(f'--out: "{self.out}" holds a run already; add --resume, or name another folder')
+            if (self.out / "metadata.json").exists():
+                raise InputError(f'--out: "{self.out}" holds a result already; remove it, or name another folder')
+            return False
+        for name in output.NUMBERS:
+            remove_left_over(self.out / name)
+        if there:
+            return False
+        if output.status(self.out) != "finished":
+            raise InputError(f'there is no checkpoint in "{self.out}" to resume from; leave out --resume')
+        print(f"finished already: {self.out / 'report.html'}")
+        return True
+
     def _check_memory(self) -> None:
-        pixels, images = dataset.extent(self.folder)
-        values = pixels * (min(images, self.images) if self.images else images)
-        finest = max(self.options.resolutions)
-        needed = values * (READING + RECONSTRUCTION * finest**2)
-        if (there := _available_memory()) is not None and needed > there:
+        setup = dataset.read_setup(self.folder, images=self.images)
+        pixels, images = int(setup.mask.sum()), len(setup.names)
+        near = setup.near or setup.away is not None
+        needed = cost.memory(pixels, images, self.options, near=near)
+        if (there := cost.available_memory()) is not None and needed > there:
             raise InputError(
-                f"{values / pixels:.0f} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
+                f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
                 f"{there / 2**30:.1f} GiB are available; use fewer of the --images, or smaller --resolutions"
             )
 
@@ -77,16 +112,25 @@ class Run:
         status = "finished"
         try:
             with _listening() as stopped:
-                found = reconstruction.reconstruct(data, self.options, progress=sys.stderr.isatty(), after=after)
+                found = reconstruction.reconstruct(
+                    data,
+                    self.options,
+                    progress=sys.stderr.isatty(),
+                    after=after,
+                    checkpoint=self.out / CHECKPOINT,
+                    resume=self.resume,
+                )
         except KeyboardInterrupt:
             if found is None:
                 raise
             status = "interrupted"
-            print("rimlight: interrupted; writing what was found", file=sys.stderr)
+            print("rimlight: interrupted; writing the best that was found; --resume goes on", file=sys.stderr)
         output.write_numbers(self.out, found, self.options, status=status, truth=truth)
         output.write_pictures(self.out, found)
         title = f"Photometric stereo: {self.folder.resolve().name}"
         report.write(self.out, found, self.options, title=title, status=status, truth=truth)
+        if status == "finished":
+            (self.out / CHECKPOINT).unlink(missing_ok=True)
         print(f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s")
         print(f"report: {self.out / 'report.html'}")
         if (error := output.error_of_depth(found, truth)) is not None:
@@ -139,8 +183,32 @@ class Calibrate:
         return 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Inspect:
+    """Look at a data set before it is reconstructed: write a page, and print what it is like."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Images, lights and a mask, in the layout of DiLiGenT."""
+    out: Path = Path("inspection.html")
+    """The page."""
+
+    def run(self) -> int:
+        check_output(self.out, folder=False)
+        use_variant("llvm_ad_rgb")
+        with expected(OSError), expected(ValueError, pattern=REFUSAL):
+            found = inspection.inspect(self.folder)
+            inspection_page.write(self.out, found, title=f"Data set: {self.folder.resolve().name}")
+        for name, value in inspection.table(found):
+            print(f"{name:24}{value}")
+        for text in inspection.warnings(found):
+            print(f"look at this: {text}")
+        print(f"page: {self.out}")
+        return 0
+
+
 Command = (
     Annotated[Run, subcommand("run")]
+    | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Calibrate, subcommand("calibrate")]
 )
@@ -182,13 +250,3 @@ def _true_depth(folder: Path) -> np.ndarray | None:
         return None
     layers, _ = read_exr(folder / simulation.TRUE_DEPTH)
     return next(iter(layers.values()))[..., 0]
-
-
-def _available_memory() -> int | None:
-    """Bytes, where the system tells it."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    return found[0] if found else None

@@ -14,7 +14,7 @@ from pages import Page, in_browser
 from rimlight import ggx
 from rimlight.cli import _ps, main
 from rimlight.exr import read_exr, write_exr
-from rimlight.inverse.photometric_stereo import dataset, output, reconstruction, report, simulation
+from rimlight.inverse.photometric_stereo import cost, dataset, output, reconstruction, report, simulation
 from rimlight.inverse.photometric_stereo.dataset import angles, unit
 from rimlight.inverse.photometric_stereo.integration import normals_of
 from rimlight.inverse.photometric_stereo.rendering import Rendering
@@ -303,7 +303,7 @@ def test_interruption(folder, tmp_path, monkeypatch, capfd, alternations):
 
     def interrupted(*arguments):
         calls.append({path.name for path in out.iterdir()} if out.exists() else set())
-        if len(calls) == alternations + 1:
+        if len(calls) == 2 * alternations + 1:  # of the start; then of the state that each makes
             raise KeyboardInterrupt
         return update(*arguments)
 
@@ -312,10 +312,10 @@ def test_interruption(folder, tmp_path, monkeypatch, capfd, alternations):
     captured = capfd.readouterr()
     if not alternations:
         assert captured.err.splitlines()[-1] == "rimlight: interrupted"
-        assert not out.exists()
+        assert {path.name for path in out.iterdir()} == {_ps.CHECKPOINT}
         return
-    assert calls[1] == FILES
-    assert {path.name for path in out.iterdir()} == FILES | PICTURES
+    assert calls[2] == FILES | {_ps.CHECKPOINT}
+    assert {path.name for path in out.iterdir()} == FILES | PICTURES | {_ps.CHECKPOINT}
     metadata = json.loads((out / "metadata.json").read_text("utf-8"))
     assert metadata["status"] == "interrupted"
     assert len(metadata["history"]) == 1
@@ -431,9 +431,9 @@ def test_disk_that_fails(folder, tmp_path, capfd, monkeypatch):
 
 
 def test_memory_is_checked(folder, tmp_path, capfd, monkeypatch):
-    P, K = dataset.extent(folder)
-    needed = P * K * (_ps.READING + _ps.RECONSTRUCTION)
-    monkeypatch.setattr(_ps, "_available_memory", lambda: needed - 1)
+    P, K, _ = dataset.read(folder).values.shape
+    needed = cost.memory(P, K, reconstruction.Options())
+    monkeypatch.setattr(cost, "available_memory", lambda: needed - 1)
     run = ["run", str(folder), "--out", str(tmp_path / "out")]
     refused(capfd, run, f"{K} images of {P} pixels", "GiB", "--images", "--resolutions")
     monkeypatch.setattr(_ps.Run, "_reconstruct", lambda *_: 0)
