@@ -1,5 +1,4 @@
-"""What is seen in perfect mirrors and through glass, and textures that jump: what `cases.py` has of jumps that are found by
-bisection."""
+"""Perfect mirrors, glass, and textures that jump: what `cases.py` has of jumps that are found by bisection."""
 
 from __future__ import annotations
 
@@ -10,12 +9,11 @@ import mitsuba as mi
 import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
 from random_scenes import ball
-from scipy.interpolate import PchipInterpolator
 
 
-def cube(centre=(0.1, 0.7, 0.1), size: float = 0.4) -> mi.Mesh:
+def cube(centre=(0.1, 0.7, 0.1), size: float = 0.4, **props: Any) -> mi.Mesh:
     rotated = cube_vertices() @ np.array(mi.ScalarTransform4f().rotate([0.3, 1, 0.2], 35).matrix)[:3, :3].T
-    return mesh("cube", size * rotated + centre, CUBE_FACES, bsdf=diffuse(0.8, 0.5, 0.3))
+    return mesh("cube", size * rotated + centre, CUBE_FACES, **{"bsdf": diffuse(0.8, 0.5, 0.3), **props})
 
 
 def lamp() -> mi.Mesh:
@@ -35,8 +33,7 @@ def two_mirrors() -> mi.Scene:
     back = quad((-2.5, -0.5, 1.2), (0, 2.5, 0), (5, 0, 0.3), "back", bsdf=mirror)
     front = quad((-2.5, -0.5, -1.2), (5, 0, 0), (0, 2.5, 0), "front", bsdf=mirror)
     at = camera((1.9, 1.0, -0.9), (0.2, 0.5, 0.6))
-    thing = cube()
-    lit = mesh("cube", np.array(mi.traverse(thing)["vertex_positions"]).reshape(-1, 3), CUBE_FACES, bsdf=diffuse(0.0), emitter=light(2, 1, 0.5))
+    lit = cube(bsdf=diffuse(0.0), emitter=light(2, 1, 0.5))
     return scene(sensor=at, cube=lit, back=back, front=front, sky=constant(0.4))
 
 
@@ -49,9 +46,9 @@ def pane() -> mi.Scene:
     return scene(sensor=at, cube=cube(), pane=plate, floor=floor, sky=constant(0.5))
 
 
-def bar(centre=(0.1, 0.4, 0.8), name: str = "bar") -> mi.Mesh:
+def bar(centre=(0.1, 0.4, 0.8)) -> mi.Mesh:
     vertices = cube_vertices() * [0.12, 0.8, 0.12] + centre
-    return mesh(name, vertices, CUBE_FACES, bsdf=diffuse(0.0), emitter=light(3, 2.5, 2))
+    return mesh("bar", vertices, CUBE_FACES, bsdf=diffuse(0.0), emitter=light(3, 2.5, 2))
 
 
 def before_bar(shape: dict) -> mi.Scene:
@@ -79,28 +76,13 @@ def smooth_mirror() -> mi.Scene:
     return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), sky=constant(0.5))
 
 
-def goblet() -> mi.Scene:
-    """A wine glass of 8,064 smooth-shaded triangles before bars that shine."""
-    outside = [(0, 0), (0.4, 0), (0.42, 0.02), (0.4, 0.05), (0.1, 0.1), (0.06, 0.2), (0.06, 0.5), (0.1, 0.58), (0.3, 0.72)]
-    outside += [(0.42, 0.95), (0.44, 1.15), (0.4, 1.4), (0.385, 1.42)]
-    inside = [(0.37, 1.4), (0.41, 1.15), (0.39, 0.96), (0.27, 0.76), (0.1, 0.66), (0, 0.64)]
-    corners = np.array([*outside, *inside])
-    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    profile = PchipInterpolator(lengths, corners)(np.linspace(0, lengths[-1], 64))
-    m = 64
-    angles = 2 * np.pi * np.arange(m) / m
-    vertices = [[r * np.cos(a), y, r * np.sin(a)] for r, y in profile[1:-1] for a in angles]
-    rows = len(profile) - 2
-    index = lambda i, j: i * m + j % m
-    quads = [(index(i, j), index(i, j + 1), index(i + 1, j), index(i + 1, j + 1)) for i in range(rows - 1) for j in range(m)]
-    faces = [f for a, b, c, d in quads for f in ((a, c, b), (b, c, d))]
-    ends = len(vertices), len(vertices) + 1
-    vertices += [[0, profile[0, 1], 0], [0, profile[-1, 1], 0]]
-    faces += [f for j in range(m) for f in ((ends[0], index(0, j), index(0, j + 1)), (ends[1], index(rows - 1, j + 1), index(rows - 1, j)))]
-    glass = mesh("glass", np.add(vertices, [0, -0.3, 0]), faces, normals=True, bsdf={"type": "dielectric"})
-    at = camera((0.3, 1.1, -3.2), (0, 0.4, 0), fov=35)
-    bars = {f"bar{i}": bar((x, 0.4, 0.9), f"bar{i}") for i, x in enumerate((-0.5, 0.15, 0.8))}
-    return scene(sensor=at, glass=glass, **bars, sky=constant(0.2))
+def mirrored_cut() -> mi.Scene:
+    """A cube that stands in a floor, before a mirror that shows its back."""
+    wall = quad((-2, -1, 1.1), (0, 3, 0), (4, 0, 0.4), "mirror", bsdf={"type": "conductor"})
+    floor = horizontal((0, 0.25, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
+    at = camera((0.6, 1.9, -3.4), (0.1, 0.6, 0.6))
+    thing = cube((0.1, 0.4, 0))
+    return scene(sensor=at, cube=thing, floor=floor, mirror=wall, sky=constant(0.5))
 
 
 # ---------------------- Textures that jump ----------------------
@@ -175,6 +157,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "mirror_turns": (over_mirror, MIRROR, 2e-3, 3),
     "mirror_camera": (over_mirror, CAMERA, 2e-3, 2),
     "two_mirrors": (two_mirrors, TURN, 3e-3, 4),
+    "mirrored_cut": (mirrored_cut, SLIDE, 3e-3, 3),
     "pane": (pane, SLIDE, 2e-3, 5),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),
     "glass_ball_camera": (glass_ball, CAMERA, 1e-3, 6),

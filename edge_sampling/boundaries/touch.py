@@ -60,29 +60,50 @@ def touch_outline(
 
 
 def _of_mesh(ray, near, far, active) -> Touch:
+    """At the edge of a triangle beyond which the far ray passes, or where another surface cuts through the triangle."""
     near_ray, pi = near
-    p = []
+    corners = []
     with dr.resume_grad():
         for u, v in ((0, 0), (1, 0), (0, 1)):
             corner = mi.PreliminaryIntersection3f(pi)
             corner.prim_uv = mi.Point2f(u, v)
-            p.append(material_point(near_ray, corner, active).p)
-    q = [dr.detach(c) for c in p]
-    # Beyond which of the edges is the other ray?
-    n = dr.cross(q[1] - q[0], q[2] - q[0])
-    at = far[0](dr.dot(n, q[0] - far[0].o) / dr.dot(n, far[0].d))
-    b = [dr.dot(n, dr.cross(q[(i + 2) % 3] - q[(i + 1) % 3], at - q[(i + 1) % 3])) for i in range(3)]
-    least = dr.minimum(b[0], dr.minimum(b[1], b[2]))
-    pick = lambda c, k: dr.select(b[0] == least, c[(0 + k) % 3], dr.select(b[1] == least, c[(1 + k) % 3], c[(2 + k) % 3]))
-    start, end = pick(q, 1), pick(q, 2)
+            corners.append(material_point(near_ray, corner, active).p)
+    p = [dr.detach(c) for c in corners]
+    n = dr.cross(p[1] - p[0], p[2] - p[0])
+    at = far[0](dr.dot(n, p[0] - far[0].o) / dr.dot(n, far[0].d))
+    opposite = [dr.dot(n, dr.cross(p[i - 1] - p[i - 2], at - p[i - 2])) for i in range(3)]
+    least = dr.minimum(opposite[0], dr.minimum(opposite[1], opposite[2]))
+
+    def of_edge(corners, k):
+        """The first or the second end of the edge."""
+        of_others = dr.select(opposite[1] == least, corners[k - 2], corners[k - 1])
+        return dr.select(opposite[0] == least, corners[k], of_others)
+
+    start, end = of_edge(p, 1), of_edge(p, 2)
     e = end - start
-    across = dr.normalize(dr.cross(e, ray.d))
+    across = _unit(dr.cross(e, ray.d))
     aside = dr.cross(ray.d, across)
-    λ = dr.clip(dr.dot(aside, ray.o - start) / dr.dot(aside, e), 0, 1)
+    length = dr.dot(aside, e)
+    λ = dr.select(length != 0, dr.clip(dr.dot(aside, ray.o - start) / length, 0, 1), 0)
     t = dr.dot(dr.lerp(start, end, λ) - ray.o, ray.d)
     with dr.resume_grad():
-        moved = dr.dot(across, dr.lerp(pick(p, 1), pick(p, 2), λ))
-    return Touch(across, t, moved)
+        moved = dr.dot(across, dr.lerp(of_edge(corners, 1), of_edge(corners, 2), λ))
+    cut = active & far[1].is_valid() & (least > INSIDE * dr.squared_norm(n))
+    of_cut = _of_cut(ray, near, far, cut)
+    with dr.resume_grad():
+        return Touch(*(dr.select(cut, a, b) for a, b in zip(of_cut, (across, t, moved), strict=True)))
+
+
+def _of_cut(ray, near, far, active) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+    with dr.resume_grad():
+        a, b = (material_point(*side, active) for side in (near, far))
+    n, m = mi.Vector3f(dr.detach(a.n)), mi.Vector3f(dr.detach(b.n))
+    across = _unit(dr.cross(dr.cross(n, m), ray.d))
+    c, along_n, along_m = dr.dot(n, m), dr.dot(across, n), dr.dot(across, m)
+    parallel = 1 - c * c <= 0
+    α, β = ((x - c * y) / dr.select(parallel, 1, 1 - c * c) for x, y in ((along_n, along_m), (along_m, along_n)))
+    with dr.resume_grad():
+        return across, dr.dot(dr.detach(a.p) - ray.o, ray.d), α * dr.dot(n, a.p) + β * dr.dot(m, b.p)
 
 
 def _of_curved(scene, ray, near, reach, active) -> Touch:
@@ -100,6 +121,11 @@ def _of_curved(scene, ray, near, reach, active) -> Touch:
             from_rim = dr.minimum(at.uv.y, 1 - at.uv.y) * dr.norm(at.dp_dv)
             rim = (pi.shape == mi.ShapePtr(shape)) & (from_rim < 2 * reach)
             tangent = dr.select(rim, at.dp_du, tangent)
-    across = dr.normalize(dr.cross(tangent, ray.d))
+    across = _unit(dr.cross(tangent, ray.d))
     with dr.resume_grad():
         return Touch(across, dr.dot(at.p - ray.o, ray.d), dr.dot(across, si.p))
+
+
+def _unit(v: mi.Vector3f) -> mi.Vector3f:
+    """Of length 1, or 0 where v is that."""
+    return v * dr.select(dr.squared_norm(v) > 0, dr.rsqrt(dr.squared_norm(v)), 0)

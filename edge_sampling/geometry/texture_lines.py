@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .meshes import Geometry, has_place, is_map, objects_below, texture_coordinates
+from .meshes import Geometry, has_place, objects_below, texture_coordinates
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,21 @@ class Lattice:
         return mi.Vector2f(a * duv.x + b * duv.y, d * duv.x + e * duv.y)
 
 
+@dataclass(frozen=True)
+class Line:
+    """One line. lattice : mi.UInt32, number of the lattice; second : mi.Bool, is it one of the second component?"""
+
+    lattice: mi.UInt32
+    second: mi.Bool
+
+
 class TextureLines:
     """The lattices of the textures of shapes.
 
     shapes : those that count.
     """
 
-    DRJIT_STRUCT: dict = {}  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(())  # for `dr.freeze`
 
     def __init__(self, shapes: list[Any]):
         self.lattices = [Lattice(s, m) for s in shapes for m in _matrices(s)]
@@ -57,23 +65,21 @@ class TextureLines:
             found = dr.select(shape == mi.ShapePtr(lattice.shape), cell, found)
         return found
 
-    def between(self, shape: mi.ShapePtr, a: mi.Point2f, b: mi.Point2f) -> tuple[mi.UInt32, mi.Bool]:
-        """The line between two places on a surface that are next to each other: of which lattice, and is it one of the
-        second component?"""
+    def between(self, shape: mi.ShapePtr, a: mi.Point2f, b: mi.Point2f) -> Line:
+        """The line between two places on a surface that are next to each other."""
         which, second = mi.UInt32(0), mi.Bool(False)
         for i, lattice in enumerate(self.lattices):
             p, q = dr.floor(lattice.at(a)), dr.floor(lattice.at(b))
             mine = (shape == mi.ShapePtr(lattice.shape)) & ((p.x != q.x) | (p.y != q.y))
             which, second = dr.select(mine, mi.UInt32(i), which), dr.select(mine, p.x == q.x, second)
-        return which, second
+        return Line(which, second)
 
-    def across(self, line: tuple[mi.UInt32, mi.Bool], vector: mi.Vector2f) -> mi.Float:
+    def across(self, line: Line, vector: mi.Vector2f) -> mi.Float:
         """Component across a line, in units of the lattice, of a derivative of texture coordinates."""
-        which, second = line
         found = mi.Float(0)
         for i, lattice in enumerate(self.lattices):
             along = lattice.along(vector)
-            found = dr.select(which == i, dr.select(second, along.y, along.x), found)
+            found = dr.select(line.lattice == i, dr.select(line.second, along.y, along.x), found)
         return found
 
 

@@ -106,8 +106,7 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
         lacks = "outlines in the light that perfect mirrors and glass throw on other surfaces"
         lacks = lacks if from_points else "what perfect mirrors and glass show"
         limits.append(
-            f"the derivative lacks the motion of {lacks}; "
-            'give them a roughness, or set "sppi" to 0 to accept this.'
+            f'the derivative lacks the motion of {lacks}; give them a roughness, or set "sppi" to 0 to accept this.'
         )
     through = names(s for s in scene.shapes() if lets_through(s))
     if through and depths.scatters(2):
@@ -126,7 +125,7 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
 
 
 def appearance(scene: mi.Scene, moving: Moving, *, bisects: bool) -> list[str]:
-    """What lacks of the jumps inside of surfaces and environments. bisects : are textures of shapes searched for jumps?"""
+    """What lacks of the jumps inside of surfaces and environments. bisects : are the lines of textures found?"""
     limits = []
     textures = jumping_textures(scene, besides=scene.shapes() if bisects else ())
     if textures:

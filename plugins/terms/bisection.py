@@ -1,4 +1,4 @@
-"""What jumps on the film, but where no projection tells: outlines in perfect mirrors and glass, and textures, as a term.
+"""Jumps that no projection tells of, as a term: outlines in perfect mirrors and glass, and lines of textures.
 
 It is looked for. Along a short segment of the film, what is seen is compared at both ends, and where it differs, the
 segment is bisected. How the jump moves follows from a function that vanishes there.
@@ -14,8 +14,8 @@ import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart
-from rimlight.edge_sampling.boundaries.touch import touch_outline
-from rimlight.edge_sampling.geometry.texture_lines import TextureLines
+from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
+from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
 from rimlight.transport.cut_rays import CutRays
@@ -83,8 +83,10 @@ class BisectionTerm(Term):
             return FilmSamples(part.to_film(segment.middle), value, ray.wavelengths, 0.0, 0, cuts=cuts)
 
     @staticmethod
-    def _where_they_part(job: Job, chains: Chains, segment: Segment, ray, active) -> tuple[Parting, MovingVertex | None]:
-        """Where the chains from the ends of a segment part; and if there are mirrors, the vertex before, as it moves."""
+    def _where_they_part(
+        job: Job, chains: Chains, segment: Segment, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[Parting, MovingVertex | None]:
+        """Where the chains from both ends of a segment part; and behind mirrors, the vertex before, as it moves."""
         first = chains.first(segment.start, active), chains.first(segment.end, active)
         follow = lambda log: chains.part(first, segment, active, log)
         if not job.boundaries.mirrors:
@@ -108,59 +110,65 @@ class BisectionTerm(Term):
         return jump * at.a.β, alpha
 
     @staticmethod
-    def _motion(job: Job, at: Parting, segment: Segment, ray: mi.Ray3f, moving: MovingVertex | None):
-        """A function g of film position and scene that vanishes at the jump, attached to the scene; and the factor by
-        which it makes the part of the velocity that segments of this axis count, times the weight of the segment.
+    def _motion(
+        job: Job, at: Parting, segment: Segment, camera_ray: mi.Ray3f, moving: MovingVertex | None
+    ) -> tuple[mi.Float, mi.Float]:
+        """The factor by which the gradient of a function g makes the part of the velocity of a jump that segments of
+        this axis count, times the weight of the segment; and g, attached to the scene.
 
-        With the gradient ∇g over the film, the jump moves by -∇g·(∂g/∂θ) / |∇g|². Segments along both axes find it, and
-        count what is along them.
+        g depends on film position and scene, and vanishes at the jump. With its gradient ∇g over the film, the jump
+        moves by -∇g·(∂g/∂θ) / |∇g|². Segments along both axes find it, and count what is along them.
         """
+        scene, textures = job.tracer.scene, job.boundaries.textures
+        along, across, touch, line = mi.Float(0), mi.Float(0), None, None
+        if job.boundaries.mirrors:
+            touch, along, across = _at_outline(scene, at, segment)
+        if textures is not None:
+            line, *of_line = _at_line(textures, at)
+            along, across = (
+                dr.select(at.on_texture, new, old) for new, old in zip(of_line, (along, across), strict=True)
+            )
+        total = dr.square(along) + dr.square(across)
+        usable = at.found & (total > 0) & dr.isfinite(total)
+        g, ray = mi.Float(0), mi.Ray3f(at.a.ray)
         with dr.resume_grad():
-            o, d = ray.o, ray.d
+            o, d = camera_ray.o, camera_ray.d
             if moving is not None:
                 behind = at.a.depth > 1
                 o, d = dr.select(behind, moving.p, o), dr.select(behind, moving.d, d)
-            fixed = mi.Ray3f(at.a.ray)
-            fixed.o, fixed.d = dr.replace_grad(fixed.o, o), dr.replace_grad(fixed.d, d)
-        g, along, across = mi.Float(0), mi.Float(0), mi.Float(0)
-        if job.boundaries.mirrors:
-            g, along, across = _at_outline(job.tracer.scene, at, segment, fixed)
-        if job.boundaries.textures is not None:
-            of_line = _at_line(job.boundaries.textures, at, fixed)
-            with dr.resume_grad():
-                g, along, across = (
-                    dr.select(at.on_texture, new, old) for new, old in zip(of_line, (g, along, across), strict=True)
-                )
-        total = dr.square(along) + dr.square(across)
-        return dr.select(at.found & (total > 0), -segment.weight * along / total, 0), g
+            # Where something is not finite, its derivative must not even be multiplied by 0.
+            ray.o, ray.d = (
+                dr.select(usable, dr.replace_grad(v, new), v)
+                for v, new in ((ray.o, mi.Point3f(o)), (ray.d, mi.Vector3f(d)))
+            )
+            if touch is not None:
+                g = touch.moved - dr.dot(touch.n, ray.o + touch.t * ray.d)
+            if line is not None:
+                on_line = usable & at.on_texture
+                uv = at.a.pi.compute_surface_interaction(ray, mi.RayFlags.All, on_line).uv
+                g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, mi.Vector2f(uv)), 0), g)
+        return dr.select(usable, -segment.weight * along / total, 0), g
 
 
-def _at_outline(scene: mi.Scene, at: Parting, segment: Segment, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """g where rays touch an outline, and its derivatives along and across the segment. ray : attached."""
+def _at_outline(scene: mi.Scene, at: Parting, segment: Segment) -> tuple[Touch, mi.Float, mi.Float]:
+    """Where the rays touch an outline, and the derivatives of g along and across the segment."""
     a, b = (at.a.ray, at.a.pi), (at.b.ray, at.b.pi)
     a_is_near = at.a.pi.t <= at.b.pi.t
     near, far = (tuple(dr.select(a_is_near, x, y) for x, y in zip(p, q, strict=True)) for p, q in ((a, b), (b, a)))
     active = at.found & ~at.on_texture & near[1].is_valid()
     reach = segment.length * dr.norm(at.along.o + near[1].t * at.along.d)
     touch = touch_outline(scene, at.a.ray, near, far, reach, active)
-    along, across = (-dr.dot(touch.n, way.o + touch.t * way.d) for way in (at.along, at.across))
-    with dr.resume_grad():
-        g = touch.moved - dr.dot(touch.n, ray.o + touch.t * ray.d)
-        return dr.select(active, g, 0), dr.select(active, along, 0), dr.select(active, across, 0)
+    return touch, *(-dr.dot(touch.n, way.o + touch.t * way.d) for way in (at.along, at.across))
 
 
-def _at_line(textures: TextureLines, at: Parting, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """g where rays meet a line of a texture, and its derivatives along and across the segment. ray : attached."""
+def _at_line(textures: TextureLines, at: Parting) -> tuple[Line, mi.Float, mi.Float]:
+    """The line of a texture that the rays meet, and the derivatives of g along and across the segment."""
     active = at.found & at.on_texture
     here = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, active)
     there = at.b.pi.compute_surface_interaction(at.b.ray, mi.RayFlags.All, active)
     line = textures.between(at.a.pi.shape, here.uv, there.uv)
-    along, across = (
-        textures.across(line, uv_derivative(here, way.at(at.a.ray, here))) for way in (at.along, at.across)
-    )
-    with dr.resume_grad():
-        uv = at.a.pi.compute_surface_interaction(ray, mi.RayFlags.All, active).uv
-        return dr.select(active, textures.across(line, mi.Vector2f(uv)), 0), along, across
+    moved = (uv_derivative(here, way.at(at.a.ray, here)) for way in (at.along, at.across))
+    return line, *(textures.across(line, duv) for duv in moved)
 
 
 def find_segment(chains: Chains, film: mi.Film, sampler: mi.Sampler) -> Segment:
@@ -179,8 +187,8 @@ def find_segment(chains: Chains, film: mi.Film, sampler: mi.Sampler) -> Segment:
         at = sampler.next_2d()
         axis = dr.select(sampler.next_1d() < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
         hidden, level = sampler.next_1d() < HIDDEN, sampler.next_1d()
-        choice = mi.UInt32(sampler.next_1d() * 2**24)
-        halvings = dr.minimum(dr.floor(-dr.log2(dr.maximum(1 - level, 2.0**-24))), HALVINGS)
+        choice = mi.UInt32(sampler.next_1d() * 0x1000000)
+        halvings = dr.minimum(dr.floor(-dr.log2(dr.maximum(1 - level, dr.epsilon(mi.Float)))), HALVINGS)
         p = dr.exp2(-dr.minimum(halvings + 1, HALVINGS))
         length = dr.select(hidden, LONGEST * dr.exp2(-halvings), LONGEST)
         density = length * dr.select(hidden, HIDDEN * p, 1 - HIDDEN) / (2 * size.x * size.y)

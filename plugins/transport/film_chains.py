@@ -330,4 +330,3 @@ def after(vertex: Vertex, link: Link) -> Vertex:
     onwards = link.onwards
     β, η = vertex.β * onwards.weight, vertex.η * onwards.η
     return Vertex(mi.Ray3f(onwards.ray), onwards.pi, vertex.depth + 1, β, η, onwards.mirrored, onwards.slides)
-
