@@ -32,7 +32,7 @@ CANDIDATES = 8
 LONGEST, SHORTEST = 1.0, 2.0**-9
 
 #: Part of the segments that are looked at for jumps of which both ends know nothing; and how often those are halved at
-#: most before.
+#: most before. All numbers are equally likely: near corners, the variance is the sum of their reciprocal probabilities.
 HIDDEN, HALVINGS = 0.25, 7
 
 #: What is looked for, in plans.
@@ -188,10 +188,9 @@ def find_segment(chains: Chains, film: mi.Film, sampler: mi.Sampler) -> Segment:
         axis = dr.select(sampler.next_1d() < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
         hidden, level = sampler.next_1d() < HIDDEN, sampler.next_1d()
         choice = mi.UInt32(sampler.next_1d() * 0x1000000)
-        halvings = dr.minimum(dr.floor(-dr.log2(dr.maximum(1 - level, dr.epsilon(mi.Float)))), HALVINGS)
-        p = dr.exp2(-dr.minimum(halvings + 1, HALVINGS))
+        halvings = dr.floor(level * (HALVINGS + 1))
         length = dr.select(hidden, LONGEST * dr.exp2(-halvings), LONGEST)
-        density = length * dr.select(hidden, HIDDEN * p, 1 - HIDDEN) / (2 * size.x * size.y)
+        density = length * dr.select(hidden, HIDDEN / (HALVINGS + 1), 1 - HIDDEN) / (2 * size.x * size.y)
         yes = mi.Bool(True)
         where = mi.Point2f(start + at * size)
         a = chains.end(where, axis, choice, yes)

@@ -178,7 +178,8 @@ def at(place, size: float = 0.35):
 
 
 def analytic(kind: str) -> Callable[..., dict]:
-    return lambda name, place, folder: {"type": kind, "to_world": at(place), "bsdf": cases.diffuse(0.5, two_sided=True)}
+    bsdf = cases.diffuse(0.5, two_sided=True)
+    return lambda name, place, folder: {"type": kind, "to_world": at(place, 0.32), "bsdf": bsdf}
 
 
 def grid_shape(name, place, folder) -> dict:
@@ -231,7 +232,9 @@ CELLS = {
     "`null` in `direct_edge`": Cell(bsdf("null")),
     "`blendbsdf` with a mirror": Cell(blend_mirror),
     "`thindielectric`": Cell(bsdf("thindielectric")),
-    "`conductor`": Cell(lambda: two({"type": "conductor"}), "brdf_0.specular_reflectance.value"),
+    "`conductor`": Cell(
+        lambda: two({"type": "conductor", "specular_reflectance": 0.5}), "brdf_0.specular_reflectance.value"
+    ),
     "`dielectric`": Cell(bsdf("dielectric", specular_reflectance=0.7), "specular_reflectance.value"),
     "`plastic`": Cell(lambda: two({"type": "plastic"}), "brdf_0.diffuse_reflectance.value"),
     "`bitmap`, `bilinear`, wrapped by `repeat`, `mirror`, `clamp`": Cell(
