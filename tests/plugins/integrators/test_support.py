@@ -179,7 +179,7 @@ def at(place, size: float = 0.35):
 
 def analytic(kind: str) -> Callable[..., dict]:
     bsdf = cases.diffuse(0.5, two_sided=True)
-    return lambda name, place, folder: {"type": kind, "to_world": at(place, 0.32), "bsdf": bsdf}
+    return lambda name, place, folder: {"type": kind, "to_world": at(place), "bsdf": bsdf}
 
 
 def grid_shape(name, place, folder) -> dict:
