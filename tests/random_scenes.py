@@ -6,7 +6,8 @@
 A scene has a floor and one to three things that hover apart from it and from each other, of random shapes and
 materials, some of them lamps; one or two lights; a sensor with its film; and one to three parameters that change
 together with one number θ. All of it may be scaled, and shifted away from the origin. What the documentation calls
-missing is left out: meshes that touch or cut each other, perfect mirrors and glass, textures that jump.
+missing is left out; and unless asked for, so are what has been there for less long: meshes that cut each other, perfect
+mirrors and glass, textures that jump.
 """
 
 from __future__ import annotations
@@ -44,6 +45,13 @@ TOLERANCE, ERRORS = 0.015, 4.0
 #: Sums over squares of so many pixels must agree within `TOLERANCE` of what the reference has there, and so many
 #: standard errors. (There are 16 of them, and their errors come from few runs.)
 SQUARE, LARGEST = 5, 5.5
+
+#: What scenes may have besides, and what that is.
+SPECIAL = {
+    "cut": "meshes stand in the floor, and in each other; none of them is a lamp",
+    "jumps": "all that things have are perfect mirrors, smooth glass, and textures that jump",
+}
+MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 
 #: A projection whose standard error is above this tells nothing: more samples are taken.
 TELLING = 0.03
@@ -125,12 +133,12 @@ class Generator:
     """Makes one scene. The same seed makes the same one, but for the sampler of its sensor.
 
     home : at the origin, and one scene unit large, whatever size and place the seed says? The image is the same.
-    cut : do meshes stand in the floor, and in each other? Then none of them is a lamp.
+    special : one of `SPECIAL`, or "".
     """
 
-    def __init__(self, seed: int, sampler: str, home: bool = False, cut: bool = False):
+    def __init__(self, seed: int, sampler: str, home: bool = False, special: str = ""):
         self.rng = np.random.default_rng([seed, 14])
-        self.sampler, self.home, self.cut = sampler, home, cut
+        self.sampler, self.home, self.special = sampler, home, special
         self.objects: dict[str, Any] = {"type": "scene"}
         self.labels: list[str] = []
         self.lights: list[np.ndarray] = []
@@ -167,8 +175,11 @@ class Generator:
         if self.home:
             self.scale, self.origin = 1.0, np.zeros(3)
         # What moves must not show instances, whose outlines are unknown: no sky, no gloss, no interreflections.
-        self.instances = self.chance(0.06)
+        self.instances = self.chance(0.06) and self.special != "jumps"
+        # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
+        self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
+        direct = direct if self.special != "jumps" else not self.glows
         self.depth = depth = 2 if direct else int(self.rng.integers(2, 6))
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
@@ -216,6 +227,9 @@ class Generator:
     def bsdf(self, uv: bool = False, closed: bool = False) -> tuple[str, dict]:
         kinds = ["diffuse", "diffuse", "twosided", "roughplastic", "roughconductor", "principled", "blend"]
         kinds += ["roughdielectric"] * closed + ["texture", "texture", "normalmap"] * uv
+        if self.special == "jumps":
+            kinds = [*MIRRORS[:3], *MIRRORS[3:] * closed]
+            kinds += ["black"] * 3 if self.glows else ["checkers", "texels", "bumps", "leaf"] * uv
         kind = "diffuse" if self.instances else self.pick(*kinds)
         colour, alpha = self.colour(), self.uniform(0.1, 0.4)
         bsdf = {
@@ -238,6 +252,24 @@ class Generator:
                 "second": {"type": "roughconductor", "alpha": alpha},
             },
             "texture": lambda: {"type": "diffuse", "reflectance": self.bitmap(5, 7)},
+            "black": lambda: {"type": "diffuse", "reflectance": 0.0},
+            "conductor": lambda: {"type": "conductor", "specular_reflectance": colour},
+            "plastic": lambda: {"type": "plastic", "diffuse_reflectance": 0.0 if self.glows else colour},
+            "thindielectric": lambda: {"type": "thindielectric"},
+            "dielectric": lambda: {"type": "dielectric", "int_ior": self.uniform(1.1, 1.6)},
+            "checkers": lambda: {"type": "diffuse", "reflectance": self.checkers()},
+            "texels": lambda: {"type": "diffuse", "reflectance": {**self.bitmap(5, 7), "filter_type": "nearest"}},
+            "bumps": lambda: {
+                "type": "bumpmap",
+                "texture": self.bitmap(5, 7),
+                "scale": 0.1,
+                "bsdf": {"type": "diffuse", "reflectance": colour},
+            },
+            "leaf": lambda: {
+                "type": "mask",
+                "opacity": self.checkers(),
+                "inner": {"type": "twosided", "inner": {"type": "diffuse", "reflectance": colour}},
+            },
             "normalmap": lambda: {
                 "type": "normalmap",
                 "normalmap": self.normal_map(),
@@ -245,6 +277,10 @@ class Generator:
             },
         }[kind]()
         return kind, bsdf
+
+    def checkers(self) -> dict:
+        place = mi.ScalarTransform3f().rotate(self.uniform(0, 360)).scale([self.uniform(1, 4), self.uniform(1, 4)])
+        return {"type": "checkerboard", "color0": self.uniform(0, 0.3), "color1": self.colour(), "to_uv": place}
 
     def normal_map(self) -> dict:
         n = np.concatenate([self.rng.uniform(-0.2, 0.2, (5, 7, 2)), np.ones((5, 7, 1))], 2)
@@ -355,15 +391,15 @@ class Generator:
         name = f"thing{i}"
         centre = [[-0.9, 0.5, 0], [0.9, 0.7, -0.3], [0, 1.6, 0.4]][i] + self.rng.uniform(-0.1, 0.1, 3)
         size, q = self.uniform(0.35, 0.55), self.rotation()
-        if self.cut:
+        if self.special == "cut":
             analytic = kind in ("sphere", "cylinder", "disk")
             centre = np.add(centre, [0, 1.4, 0]) if analytic else centre * [0.4, 0, 1] + [0, 0.5 * size - 0.4, 0]
         closed = kind not in ("quad", "half", "disk", "cylinder", "needle")
         uv = kind not in ("sphere", "cylinder", "disk", "tetra") and self.chance(0.6)
         material, bsdf = self.bsdf(uv, closed and kind != "torus")
         if not closed:
-            bsdf = self.two_sided(bsdf) if material != "roughdielectric" else bsdf
-        lamp = self.chance(0.15) and not self.cut
+            bsdf = self.two_sided(bsdf) if bsdf["type"] not in ("roughdielectric", "thindielectric", "mask") else bsdf
+        lamp = (self.chance(0.15) and self.special != "cut") or material == "black"
         emitter = self.emitter(0.5, 3) if lamp else None
         smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
         smooth &= not lamp or kind == "fine"  # what coarse lamps light is off by some per cent, with a warning
@@ -540,8 +576,8 @@ class Generator:
         return change
 
 
-def make(seed: int, sampler: str = "independent", home: bool = False, cut: bool = False) -> RandomScene:
-    return Generator(seed, sampler, home, cut).make()
+def make(seed: int, sampler: str = "independent", home: bool = False, special: str = "") -> RandomScene:
+    return Generator(seed, sampler, home, special).make()
 
 
 # ---------------------- Comparison ----------------------
@@ -628,25 +664,25 @@ def _squares(images: np.ndarray) -> np.ndarray:
     return sums
 
 
-def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES, cut: bool = False) -> Comparison:
+def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES, special: str = "") -> Comparison:
     """Compare a scene's derivative with finite differences, with more samples until the answer is clear.
 
     Scenes that do not agree in the end are compared once more, over a tenth of the step: a lamp that comes into the
     frame within a step, say, is no part of the derivative.
     """
-    row = _compare(seed, stages, STEP, cut)
+    row = _compare(seed, stages, STEP, special)
     if row.agrees or row.raised or not row.finite or len(stages) < len(STAGES):
         return row
-    again = _compare(seed, stages[-1:], STEP / 10, cut)
+    again = _compare(seed, stages[-1:], STEP / 10, special)
     again.seconds += row.seconds
     return again if again.agrees and again.error < 0.1 else row
 
 
-def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, cut: bool) -> Comparison:
+def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, special: str) -> Comparison:
     start, row = time.time(), Comparison(seed, "")
     try:
         # Finite differences at the origin, where rays start close to surfaces, and single precision tells most.
-        still, moving = make(seed, "multijitter", home=True, cut=cut), make(seed, cut=cut)
+        still, moving = make(seed, "multijitter", home=True, special=special), make(seed, special=special)
         row.label = still.label
         path = mi.load_dict({"type": "path", "max_depth": still.max_depth, "rr_depth": 1000})
         integrator = mi.load_dict(moving.integrator)
@@ -682,7 +718,9 @@ def main() -> None:
     parser.add_argument("--only", type=int, nargs="*", help="these seeds")
     parser.add_argument("--quick", action="store_true", help="the first stage only")
     parser.add_argument("--thorough", action="store_true", help="the last stage at once")
-    parser.add_argument("--cut", action="store_true", help="meshes stand in the floor, and in each other")
+    parser.add_argument(
+        "--special", choices=SPECIAL, default="", help="; ".join(f"{k}: {v}" for k, v in SPECIAL.items())
+    )
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, help="rows as JSON, one a line; seeds that it has are not repeated")
     args = parser.parse_args()
@@ -693,8 +731,9 @@ def main() -> None:
         known = {json.loads(line)["seed"] for line in args.out.read_text().splitlines()}
         seeds = [s for s in seeds if s not in known]
     if args.processes > 1:
-        flags = (("--quick", args.quick), ("--thorough", args.thorough), ("--cut", args.cut))
+        flags = (("--quick", args.quick), ("--thorough", args.thorough))
         options = [o for o, given in flags if given]
+        options += ["--special", args.special] if args.special else []
         options += ["--out", str(args.out)] if args.out else []
         parts = [seeds[k :: args.processes] for k in range(args.processes)]
         command = [sys.executable, __file__, *options, "--only"]
@@ -703,7 +742,7 @@ def main() -> None:
     stages = STAGES[:1] if args.quick else STAGES[-1:] if args.thorough else STAGES
     bad = []
     for seed in seeds:
-        row = compare(seed, stages, args.cut)
+        row = compare(seed, stages, args.special)
         print(row, flush=True)
         bad += [] if row.agrees else [seed]
         if args.out:

@@ -268,24 +268,18 @@ def warnings_of(scene, key, options, **motion) -> str:
 
 
 def test_limits_are_warned_about_once():
-    lamp = lambda: {"type": "point", "position": [0, 4, 0], "intensity": {"type": "rgb", "value": 5.0}}
-    mirror = lambda: {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().translate([0, -2, 0]),
-        "bsdf": {"type": "conductor"},
+    projector = lambda: {
+        "type": "projector",
+        "to_world": mi.ScalarTransform4f().look_at([0, 4, -3], [0, 0, 0], [0, 1, 0]),
+        "irradiance": {"type": "checkerboard"},
     }
-    board = lambda: {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().translate([0, -3, 0]),
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
-    }
-    scene = cases.cube(lamp=lamp, mirror=mirror, board=board)()
+    scene = cases.cube(lamp=projector)()
     text = warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
-    for part in ("perfect mirrors", "jumps of the textures"):
+    for part in ("border of the beams", "jumps of the textures"):
         assert text.count(part) == 1
     assert "hard shadows" not in text
     quiet = warnings_of(scene, "cube.vertex_positions", {"sppi": 0}, direction=[1, 0, 0])
-    assert "perfect mirrors" not in quiet
+    assert "border of the beams" not in quiet
 
 
 @pytest.mark.parametrize(("shape", "curved"), [("sphere", True), ("rectangle", False)])
