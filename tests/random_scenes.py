@@ -193,6 +193,9 @@ class Generator:
         kinds: list[str] = []
         for i in range(self.rng.integers(1, 3)):
             kinds.append(self.make_light(i, kinds))
+        if self.special == "jumps" and not {"sky", "environment"} & set(kinds):
+            # Without one, `path` drops light that comes through a mask or a thin glass.
+            self.objects["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}}
         scene = mi.load_dict(self.objects)
         params, move = self.make_motion(scene, cameras=not self.instances)
         return RandomScene(scene, params, move, integrator, depth, " ".join(self.labels))
