@@ -21,10 +21,10 @@ import numpy as np
 
 from rimlight.edge_sampling.geometry.device_edges import line_of_sight
 from rimlight.edge_sampling.geometry.edges import Edges
-from rimlight.edge_sampling.geometry.meshes import Geometry, lets_light_through
+from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.lights import Lights
-from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
-from rimlight.edge_sampling.rays import BEHIND, BESIDE_LINE, lift
+from rimlight.edge_sampling.projection.sensors import inside_frame
+from rimlight.edge_sampling.rays import lift
 
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
@@ -88,7 +88,7 @@ class FilmBoundary:
     seams : do the seams of the texture coordinates of spheres, disks and cylinders count?
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("outlines", "lights", "farther"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("outlines", "lights"))  # for `dr.freeze`
 
     def __init__(
         self,
@@ -102,24 +102,11 @@ class FilmBoundary:
     ):
         self.lights = lights
         self.outlines = FilmOutlines(geometry, edges, moving, soft=soft, seams=seams)
-        self.farther = self._farther(geometry)
 
     @property
     def edge_count(self) -> int:
         """Number of edges, and of pieces of curves."""
         return self.outlines.counts[0] + self.outlines.counts[3]
-
-    def _farther(self, geometry: Geometry) -> mi.Float | None:
-        """How much farther beside edges, cuts, horizons and pieces of curves, in this order, to look than rounding
-        asks for: in units of the offset of rays; None: nowhere."""
-        meshes = geometry.meshes
-        transmits = [lets_light_through(m) for m in meshes]
-        if not any(transmits) and not geometry.line_vertices:
-            return None
-        counts = [*(m.vertex_count() for m in meshes), geometry.line_vertices]
-        vertex = np.repeat([*(BEHIND * t for t in transmits), BESIDE_LINE], counts)
-        on_curves = np.zeros(self.outlines.counts[3])
-        return mi.Float(np.float32(np.concatenate([vertex[self.outlines.first_vertices], on_curves])))
 
     def sample(
         self,
@@ -186,7 +173,7 @@ class FilmBoundary:
                 n_dl = dr.select(chosen.is_horizon, dr.mulsign(n_dl, dr.dot(n_dl, found.facing)), n_dl)
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
-            offset = self._offset(scene, at.projection, p, chosen.index) * dr.normalize(n_dl)
+            offset = self._offset(scene, at, p, chosen) * dr.normalize(n_dl)
             rays, weights = _beside(at, sensor, sampler, u, offset, active)
             active = self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, active)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
@@ -229,13 +216,14 @@ class FilmBoundary:
             side = dr.select(chosen.is_edge & self.outlines.edges.is_fold(at.positions, chosen.edge, p, sight), side, 0)
         return [Horizon(dr.select(chosen.is_horizon, mi.Float(sign), side), p, chosen.is_horizon) for sign in (-1, 1)]
 
-    def _offset(self, scene: mi.Scene, projection: Projection, p: mi.Point3f, index: mi.UInt32) -> mi.Float:
+    def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart."""
-        ulp = dr.epsilon(mi.Float) * 2
+        projection, ulp = at.projection, dr.epsilon(mi.Float) * 2
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = 8 * ulp * largest
-        if self.farther is not None:
-            in_world += dr.gather(mi.Float, self.farther, index) * lift(scene, p)
+        if self.outlines.edges is not None and self.outlines.edges.any_farther:
+            farther = self.outlines.edges.farther(at.positions, chosen.edge)
+            in_world += dr.select(chosen.is_edge, farther, 0) * lift(scene, p)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film

@@ -91,7 +91,7 @@ class FilmOutlines:
         cut = geometry.lines is not None and bool(moving[list(geometry.lines.meshes)].any())
         edges, faces = edges.of_meshes(moving, lines=cut), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays.)
-        self.edges = DeviceEdges(edges) if len(edges) else None
+        self.edges = DeviceEdges(edges, geometry) if len(edges) else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
         #: Which edges are on meshes that reflect light from all directions, but from behind?
         spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes])
@@ -104,10 +104,6 @@ class FilmOutlines:
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
         cuts = len(faces) if len(edges) else 0
         self.counts = (len(edges), cuts, len(horizons), len(self.curves) if shapes else 0)
-        #: The first vertex of each edge, cut and horizon, on the host.
-        first = [edges.vertices[:, 0, 0], faces[:, 0] if len(edges) else []]
-        first.append(horizons.faces[:, 0] if len(horizons) else [])
-        self.first_vertices = np.concatenate([np.asarray(v, np.int64) for v in first])
 
     @property
     def any_smooth(self) -> bool:

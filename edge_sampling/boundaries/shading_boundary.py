@@ -245,7 +245,7 @@ class ShadingBoundary:
             near = 1 - vicinity.far(dr.square(distance))
             active &= (outward != 0) | (near > 0)
             n_dl = dr.select(active, n_dl, 0)
-            aside = self.silhouettes.beside(scene, sample, p, x)
+            aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
             def look(side, active, slack=1):
                 """What is seen beside the edge, unless something before the edge hides it."""

@@ -115,7 +115,7 @@ class EdgeTree:
 
     def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray]):
         self.geometry = geometry
-        self.device_edges = DeviceEdges(edges)
+        self.device_edges = DeviceEdges(edges, geometry)
         position = geometry.host_positions()
         ends = position[edges.vertices[:, 0]]
         centres = np.where(np.isfinite(ends), ends, 0).mean(1)

@@ -11,8 +11,8 @@ import numpy as np
 from rimlight.edge_sampling.geometry.curves import PIECES, Curves
 from rimlight.edge_sampling.geometry.device_edges import beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
-from rimlight.edge_sampling.geometry.meshes import Geometry, lets_light_through
-from rimlight.edge_sampling.rays import BEHIND, BESIDE_LINE, lift
+from rimlight.edge_sampling.geometry.meshes import Geometry
+from rimlight.edge_sampling.rays import lift
 
 from .edge_tree import EdgeTree
 from .sampling import EdgeSample, sample_edge
@@ -75,7 +75,7 @@ class Silhouettes:
     Moving edges are a group of their own, so that viewers that stand still need not look at the others.
     """
 
-    _NUMBERS = ("count", "groups", "centre", "_first_line", "_farther")
+    _NUMBERS = ("count", "groups", "centre", "_first_line")
     DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
@@ -91,10 +91,6 @@ class Silhouettes:
         #: Number of groups of edges.
         self.groups = len(groups)
         self.tree = EdgeTree(geometry, edges, groups) if groups else None
-        transmit = np.array([lets_light_through(m) for m in geometry.meshes])
-        far = np.where(edges.is_line, BESIDE_LINE, BEHIND * transmit[edges.mesh].any(1))
-        #: How much farther beside edges to look than rounding asks for, in units of the offset of rays; None: nowhere.
-        self._farther = mi.Float(np.float32(far)) if far.any() else None
         self.curves = Curves(geometry.analytic) if geometry.analytic else None
         self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
 
@@ -195,12 +191,16 @@ class Silhouettes:
             return mi.Bool(False)
         return (sample.edge < self.count) & self.tree.device_edges.is_smooth(dr.minimum(sample.edge, self.count - 1))
 
-    def beside(self, scene: mi.Scene, sample: EdgeSample, p: mi.Point3f, x: mi.Point3f) -> mi.Float:
+    def beside(
+        self, scene: mi.Scene, placement: Placement, sample: EdgeSample, p: mi.Point3f, x: mi.Point3f
+    ) -> mi.Float:
         """How far beside a point p that was sampled to look from x: scene units."""
         aside = beside_edge(p, x)
-        if self._farther is None:
+        if self.tree is None or not self.tree.device_edges.any_farther:
             return aside
-        return aside + dr.gather(mi.Float, self._farther, sample.edge, sample.edge < self.count) * lift(scene, p)
+        active = sample.edge < self.count
+        farther = self.tree.device_edges.farther(placement.positions, dr.select(active, sample.edge, 0))
+        return aside + dr.select(active, farther, 0) * lift(scene, p)
 
     def point(
         self, placement: Placement, sample: EdgeSample, eye: mi.Point3f, far: mi.Bool | bool = False

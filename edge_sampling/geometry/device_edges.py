@@ -6,22 +6,26 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.rays import BEHIND, BESIDE_LINE
+
 from .edges import EdgeKind, Edges
-from .meshes import Geometry
+from .meshes import Geometry, lets_light_through
 
 #: Faces whose normals differ by less (sine of the angle) count as coplanar; vertex normals, as equal.
 COPLANAR = 1e-5
 
 
 class DeviceEdges:
-    """Topology of `Edges` as Dr.Jit arrays. Vertex positions are given with each call, since they change."""
+    """Topology of `Edges` as Dr.Jit arrays. Vertex positions are given with each call, since they change.
+
+    geometry : the meshes.
+    """
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
-    DRJIT_STRUCT = dict.fromkeys(
-        ("count", "_ends", "_opposite", "_kind", "_kinds", "any_smooth", "_any_split", "_two_faces")
-    )
+    _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_is_line", "_farther")
+    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "any_smooth", "any_farther", "_any_split", *_OF_EDGES))
 
-    def __init__(self, edges: Edges):
+    def __init__(self, edges: Edges, geometry: Geometry):
         index = lambda a: mi.UInt32(np.ascontiguousarray(a))
         self.count = len(edges)
         self._ends = [[index(edges.vertices[:, side, k]) for k in (0, 1)] for side in (0, 1)]
@@ -31,6 +35,12 @@ class DeviceEdges:
         #: Are there edges with interpolated normals?
         self.any_smooth = not self._kinds.isdisjoint({EdgeKind.SMOOTH, EdgeKind.SPLIT})
         self._two_faces = mi.Bool(edges.count == 2)
+        self._is_line = mi.Bool(edges.is_line)
+        transmit = np.array([lets_light_through(m) for m in geometry.meshes])
+        farther = np.where(edges.is_line, BESIDE_LINE, BEHIND * transmit[edges.mesh].any(1))
+        self._farther = mi.Float(np.float32(farther))
+        #: Is there an edge beside which `farther` is not 0?
+        self.any_farther = bool(farther.any())
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
@@ -114,6 +124,18 @@ class DeviceEdges:
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         sine = dr.norm(dr.cross(first, second))
         return dr.select(dr.gather(mi.Bool, self._two_faces, edge) & (sine > COPLANAR), dr.square(sine), 0)
+
+    def farther(self, positions: mi.Float, edge: mi.UInt32) -> mi.Float:
+        """How much farther beside edges to look than rounding asks for, in units of the offset of rays. Detached.
+
+        Rays start that far below the first face of glass, and so above the second, if they are closer to the edge than
+        this times the cotangent of the angle between both.
+        """
+        first, second = (dr.normalize(n) for n in self.normals(positions, edge))
+        cotangent = dr.dot(first, second) / dr.norm(dr.cross(first, second))
+        wedge = dr.select(dr.gather(mi.Bool, self._two_faces, edge), dr.clip(cotangent, 0, 1), 0)
+        wedge = dr.select(dr.gather(mi.Bool, self._is_line, edge), 1, wedge)
+        return dr.detach(dr.gather(mi.Float, self._farther, edge) * wedge)
 
     def is_smooth(self, edge: mi.UInt32) -> mi.Bool:
         """Are interpolated normals, and all else, the same on both sides?"""

@@ -28,8 +28,8 @@ from .term import FilmSamples, Job, Sample, Term
 #: Segments of the film among which one is chosen whose ends differ.
 CANDIDATES = 8
 
-#: Length of the segments, pixels; and to which they are bisected.
-LONGEST, SHORTEST = 1.0, 2.0**-9
+#: Length of the segments, pixels; and to which they are bisected, in units in the last place of the film's size.
+LONGEST, SHORTEST = 1.0, 16
 
 #: Part of the segments that are looked at for jumps of which both ends know nothing; and how often those are halved at
 #: most before. All numbers are equally likely: near corners, the variance is the sum of their reciprocal probabilities.
@@ -103,7 +103,7 @@ class BisectionTerm(Term):
         """Difference of radiance and alpha between the first chain and the second. Detached."""
         jump, alpha = mi.Spectrum(0), mi.Float(0)
         for sign, vertex, other in ((1, at.a, at.b), (-1, at.b, at.a)):
-            inside = ~at.on_texture & (vertex.pi.t <= other.pi.t)
+            inside = ~at.on_texture & ~at.grazes & (vertex.pi.t <= other.pi.t)
             L, stopped = job.tracer.arriving(vertex, sampler.clone(), at.found, inside)
             jump += sign * L
             alpha += sign * dr.select(stopped & (vertex.depth == 1), mi.Float(1), 0)
@@ -123,6 +123,11 @@ class BisectionTerm(Term):
         along, across, touch, line = mi.Float(0), mi.Float(0), None, None
         if job.boundaries.mirrors:
             touch, along, across = _at_outline(scene, at, segment)
+            if moving is not None:
+                of_plane = (dr.dot(dr.detach(moving.n), way.d) for way in (at.along, at.across))
+                along, across = (
+                    dr.select(at.grazes, new, old) for new, old in zip(of_plane, (along, across), strict=True)
+                )
         if textures is not None:
             line, *of_line = _at_line(textures, at)
             along, across = (
@@ -143,6 +148,7 @@ class BisectionTerm(Term):
             )
             if touch is not None:
                 g = touch.moved - dr.dot(touch.n, ray.o + touch.t * ray.d)
+                g = dr.select(at.grazes, dr.select(usable & at.grazes, dr.dot(moving.n, ray.d), 0), g)
             if line is not None:
                 on_line = usable & at.on_texture
                 uv = at.a.pi.compute_surface_interaction(ray, mi.RayFlags.All, on_line).uv
@@ -229,5 +235,6 @@ def bisect(chains: Chains, segment: Segment, sampler: mi.Sampler) -> Segment:
         middle = chains.end(segment.middle, segment.axis, segment.choice, mi.Bool(True))
         return segment.half(middle, sampler), sampler
 
-    going = lambda segment, _: (segment.weight > 0) & (segment.length > SHORTEST)
+    shortest = SHORTEST * 2 * dr.epsilon(mi.Float) * max(chains.rays.offset + chains.rays.size)
+    going = lambda segment, _: (segment.weight > 0) & (segment.length > shortest)
     return dr.while_loop((segment, sampler), going, step, label="bisection")[0]

@@ -184,7 +184,7 @@ class Link:
     onwards : the next ray, and what that meets.
     ways : derivatives of the next ray.
     lobe : mi.UInt32, 0 if there is no next vertex, 1 if the next ray has the same direction, 2 if it is reflected, 3
-        if it is refracted.
+        if it is refracted; and 4 more, if interpolated normals send it to the wrong side of its face.
     numbers : random numbers.
     """
 
@@ -202,6 +202,7 @@ class Parting:
     a, b : the vertices at which they do: what the same ray of both meets.
     along, across : derivatives of the ray to a.
     on_texture : mi.Bool, is it at a line of a texture?
+    grazes : mi.Bool, is it where the ray passes from one side of the face from which it starts to the other?
     found : mi.Bool, do they, in a way that is no edge as the camera sees it?
     """
 
@@ -210,6 +211,7 @@ class Parting:
     along: RayDerivative
     across: RayDerivative
     on_texture: mi.Bool
+    grazes: mi.Bool
     found: mi.Bool
 
 
@@ -245,7 +247,9 @@ class Chains:
         next_pi = scene.ray_intersect_preliminary(next_ray, active=goes_on)
         onwards = Next(next_ray, next_pi, weight, bs.eta, goes_on & through, mirrored, mirrored)
         reflected = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)
-        lobe = dr.select(goes_on, dr.select(through, mi.UInt32(1), dr.select(reflected, mi.UInt32(2), 3)), 0)
+        wrong = (dr.dot(ray.d, si.n) * dr.dot(next_ray.d, si.n) > 0) == reflected
+        lobe = dr.select(reflected, mi.UInt32(2), 3) + dr.select(wrong, mi.UInt32(4), 0)
+        lobe = dr.select(goes_on, dr.select(through, mi.UInt32(1), lobe), 0)
         at = ways[0].at(ray, si)
         beyond = tuple(
             dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
@@ -271,7 +275,7 @@ class Chains:
         def step(vertex, derivative, seen, active):
             link = self.link(vertex, (derivative,), choice, active)
             found = link.seen
-            found.way = mi.sample_tea_32(seen.way, 4 * found.way + link.lobe)[0]
+            found.way = mi.sample_tea_32(seen.way, 8 * found.way + link.lobe)[0]
             found.cells = mi.sample_tea_32(seen.cells, found.cells)[0]
             found.shown = mi.Bool(seen.shown)
             goes_on = active & (link.lobe > 0)
@@ -297,32 +301,35 @@ class Chains:
         rays, axis, choice = self.rays, segment.axis, segment.choice
         aside = mi.Vector2f(axis.y, axis.x)
 
-        def step(a, b, of_a, of_b, shown, on_texture, found, active):
+        def step(a, b, of_a, of_b, shown, on_texture, grazes, found, active):
             here, there = self.link(a, of_a, choice, active), self.link(b, of_b, choice, active)
             same_shape = here.seen.way == there.seen.way
-            parts = ~same_shape | here.seen.is_apart_from(there.seen, segment.length)
-            on_line = active & ~parts & (here.seen.cells != there.seen.cells)
+            # Is one of both on the wrong side of its face? If that is another face, they part at the edge.
+            turns, same_face = (here.lobe ^ there.lobe) == 4, a.pi.prim_index == b.pi.prim_index
+            parts = ~same_shape | here.seen.is_apart_from(there.seen, segment.length) | (turns & ~same_face)
+            on_line = active & ~parts & ~grazes & (here.seen.cells != there.seen.cells)
             on_texture |= on_line
-            found |= (active & parts & shown) | on_line
-            goes_on = active & ~parts & ~on_line & (here.lobe > 0) & (here.lobe == there.lobe)
+            found |= (active & (parts | grazes) & shown) | on_line
+            goes_on = active & ~parts & ~grazes & ~on_line & (here.lobe > 0) & ((here.lobe == there.lobe) | turns)
+            grazes |= goes_on & turns
             if log is not None:
                 log.leave(a.depth, a.β, here.numbers, goes_on)
                 log.arrive(a.depth + 1, here.onwards, goes_on)
             a, b = (dr.select(goes_on, after(v, link), v) for v, link in ((a, here), (b, there)))
             of_a = tuple(dr.select(goes_on, new, old) for new, old in zip(here.ways, of_a, strict=True))
             of_b = tuple(dr.select(goes_on, new, old) for new, old in zip(there.ways, of_b, strict=True))
-            return a, b, of_a, of_b, shown | (goes_on & (here.lobe >= 2)), on_texture, found, goes_on
+            return a, b, of_a, of_b, shown | (goes_on & (here.lobe >= 2)), on_texture, grazes, found, goes_on
 
         if log is not None:
             log.arrive(first[0].depth, first[0], active)
         no = dr.full(mi.Bool, False, dr.width(active))
         of_a = rays.derivative(segment.start, axis), rays.derivative(segment.start, aside)
         of_b = (rays.derivative(segment.end, axis),)
-        state = (*first, of_a, of_b, no, mi.Bool(no), mi.Bool(no), mi.Bool(active))
-        a, b, of_a, _, _, on_texture, found, _ = dr.while_loop(
+        state = (*first, of_a, of_b, no, mi.Bool(no), mi.Bool(no), mi.Bool(no), mi.Bool(active))
+        a, b, of_a, _, _, on_texture, grazes, found, _ = dr.while_loop(
             state, lambda *state: state[-1], step, label="chains of mirrors"
         )
-        return Parting(a, b, *of_a, on_texture, found)
+        return Parting(a, b, *of_a, on_texture, grazes, found)
 
 
 def after(vertex: Vertex, link: Link) -> Vertex:
