@@ -10,6 +10,7 @@ from rimlight.edge_sampling.geometry.texture_lines import TextureLines
 
 from .face_planes import FacePlanes
 from .film_boundary import FilmBoundary
+from .fine_mirrors import FineMirrors
 from .indirect_shadows import IndirectShadows
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary
@@ -19,9 +20,9 @@ from .shadow_boundary import ShadowBoundary
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
     does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see
-    `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `textures` :
-    where those jump that the camera may see move. `lights` : chooses one, where
-    there are many."""
+    `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` :
+    those whose fringe is not looked at closely. `textures` : where those jump that the camera may see move. `lights` :
+    chooses one, where there are many."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -34,6 +35,7 @@ class Boundaries:
     limits: tuple[str, ...] = ()
     glass: bool = False
     mirrors: bool = False
+    fine_mirrors: FineMirrors | None = None
     textures: TextureLines | None = None
     lights: LightChoice | None = None
 

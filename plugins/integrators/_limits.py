@@ -19,8 +19,9 @@ from rimlight.edge_sampling import (
     objects_below,
     t_junctions,
 )
+from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.cut_curves import cut_curves
-from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, has_normal_map, is_smooth, vertices
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth, vertices
 from rimlight.edge_sampling.rays import extent
 from rimlight.transport.paths import Depths
 
@@ -249,37 +250,24 @@ def coarse_lamps(scene: mi.Scene) -> list[str]:
     normals, but faces turn away one after the other, each while its light is not yet 0."""
     shapes = [e.get_shape() for e in scene.emitters() if e.get_shape() is not None]
     return [
-        f"where the light of {names([s])[0]} falls, the derivative is off by up to about {100 * _fringe(s):.1g} %, "
+        f"where the light of {names([s])[0]} falls, the derivative is off by up to about {100 * fringe(s):.1g} %, "
         "since Mitsuba shades the faces of its coarse mesh with interpolated normals. Give it a finer mesh or face "
         "normals."
         for s in shapes
-        if _fringe(s) > FRINGE
+        if fringe(s) > FRINGE
     ]
 
 
 def coarse_meshes(scene: mi.Scene) -> list[str]:
     """What a derivative without `FacePlanes` lacks: the faces of smooth-shaded meshes hide light from themselves."""
     sized = [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Delta and not hasattr(e, "light_count")]
-    coarse = names(s for s in scene.shapes() if _fringe(s) > FRINGE) if sized else []
+    coarse = names(s for s in scene.shapes() if fringe(s) > FRINGE) if sized else []
     if not coarse:
         return []
     return [
         f"the derivative lacks what the faces of {', '.join(coarse)} hide of lamps with a size, while interpolated "
         "normals go on being lit. Give them finer meshes or face normals, or use direct_edge or prb_edge."
     ]
-
-
-def _fringe(shape: mi.Shape) -> float:
-    """How far the cosine between the normals of faces and vertices is below 1, at most; 0 without interpolated ones."""
-    if not shape.is_mesh() or not has_interpolated_normals(shape):
-        return 0.0
-    corners, normals = faces(shape), np.array(dr.detach(shape.vertex_normals_buffer())).reshape(-1, 3)
-    p = vertices(shape)[corners].astype(np.float64)
-    flat = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None]
-    n = normals[corners]
-    size = np.linalg.norm(flat, axis=2) * np.linalg.norm(n, axis=2)
-    cos = np.abs((flat * n).sum(2))[size > 0] / size[size > 0]
-    return float(1 - cos.min()) if cos.size else 0.0
 
 
 #: How far the cosine between the normals of faces and vertices may be below 1, without a warning.

@@ -24,6 +24,7 @@ from rimlight.edge_sampling import (
     TextureLines,
     find_welded_edges,
 )
+from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
@@ -170,11 +171,12 @@ class BoundarySearch:
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights
-        mirrors = self.from_points and self.depths.scatters(1) and any(is_mirror(s) for s in scene.shapes())
-        textures = TextureLines(scene.shapes() if mirrors else moving.on_film) if self.from_points else ()
+        mirrors = [s for s in scene.shapes() if is_mirror(s)] if self.from_points and self.depths.scatters(1) else []
+        mirrors = bool(mirrors), FineMirrors(mirrors) if mirrors else None
+        textures = TextureLines(scene.shapes() if mirrors[0] else moving.on_film) if self.from_points else ()
         textures = textures if len(textures) else None
         lights = LightChoice.of(scene)
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, mirrors, textures, lights)
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *mirrors, textures, lights)
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int

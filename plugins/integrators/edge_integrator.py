@@ -208,6 +208,7 @@ class EdgeIntegrator(ADIntegrator):
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
         tracer = self.TRACER(scene, self)
         tracer.glass, tracer.lights = boundaries.glass, boundaries.lights
+        tracer.fine_mirrors = boundaries.fine_mirrors
         return Job(tracer, sensor, boundaries, counts, rays, seed, mode)
 
     @no_collection()

@@ -238,6 +238,8 @@ class Chains:
         scene, ray, pi = self.tracer.scene, vertex.ray, vertex.pi
         met = active & pi.is_valid()
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, met)
+        if self.tracer.fine_mirrors is not None:
+            self.tracer.fine_mirrors.turn(si, ray, met)
         numbers = Numbers(mi.Point2f(0), mi.sample_tea_float32(choice, vertex.depth), mi.Point2f(0.5))
         goes_on = met & self.tracer.scatters(vertex.depth) & self.mirrors
         bs, weight = si.bsdf(ray).sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, goes_on)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
 from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.choice.light_choice import LightChoice
@@ -58,12 +59,14 @@ def scattered_light(
     beside_outline: mi.Bool | None = None,
     lune: Lune | None = None,
     lights: LightChoice | None = None,
+    fine_mirrors: FineMirrors | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
     beside_outline : is this vertex just inside of an outline? Then interpolated normals that face away are turned.
     lune : see `Scattering.scatter`, for this vertex.
     lights : see `Scattering`.
+    fine_mirrors : of which the normals are turned at this vertex.
 
     Returns
     -------
@@ -78,6 +81,8 @@ def scattered_light(
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         if beside_outline is not None:
             turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
+        if fine_mirrors is not None:
+            fine_mirrors.turn(si, vertex.ray, active & (vertex.depth == first))
         from_lune = lune.where(active & (vertex.depth == first)) if lune is not None else None
         numbers = scattering.draw(sampler, active)
         direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), numbers, active, lune=from_lune)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side
 from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
@@ -46,6 +47,9 @@ class PathTracer:
     #: See `Scattering`.
     lights: LightChoice | None = None
 
+    #: Whose normals are turned on the sides of boundaries.
+    fine_mirrors: FineMirrors | None = None
+
     def __init__(self, scene: mi.Scene, integrator: mi.ad.common.ADIntegrator):
         self.scene = scene
         self.depths: Depths = integrator.depths
@@ -67,11 +71,13 @@ class PathTracer:
         attached: bool,
         horizon: Horizon | None = None,
         lune: Lune | None = None,
+        fine_mirrors: FineMirrors | None = None,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
 
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
         lune : see `Scattering.scatter`, for the first hit.
+        fine_mirrors : of which the normals are turned there.
         """
         scene = self.scene
         active = active & (self.depths.max_depth > 0)
@@ -83,6 +89,8 @@ class PathTracer:
         si = seen_by_camera(ray, pi, active, attached=attached)
         if horizon is not None:
             turn_to_side(si, ray, horizon)
+        if fine_mirrors is not None:
+            fine_mirrors.turn(si, ray, active)
         with dr.resume_grad(when=attached):
             if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
@@ -127,7 +135,8 @@ class PathTracer:
         self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None, lune: Lune | None
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, detached."""
-        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, lune=lune)
+        turned = {"horizon": horizon, "lune": lune, "fine_mirrors": self.fine_mirrors}
+        found = self.radiance(ray, sampler, active, attached=False, **turned)
         return found.L, dr.select(found.valid, mi.Float(1), 0)
 
     # ---------------------- From points of a path ----------------------
@@ -159,7 +168,8 @@ class PathTracer:
         """
         one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
-        return scattered_light(self.scene, sampler, beyond, self.depths, active, beside_outline, lune, self.lights)[0]
+        turned = beside_outline, lune, self.lights, self.fine_mirrors
+        return scattered_light(self.scene, sampler, beyond, self.depths, active, *turned)[0]
 
     def arriving(
         self, vertex: Vertex, sampler: mi.Sampler, active: mi.Bool, beside_outline: mi.Bool
@@ -174,9 +184,8 @@ class PathTracer:
         emitted = si.emitter(self.scene).eval(si, shines)
         one = dr.full(mi.Spectrum, 1, dr.width(active))
         start = Vertex(vertex.ray, vertex.pi, vertex.depth, one, mi.Float(1), vertex.mirrored, vertex.slides)
-        scattered, stopped = scattered_light(
-            self.scene, sampler, start, self.depths, active, beside_outline, None, self.lights
-        )
+        turned = beside_outline, None, self.lights, self.fine_mirrors
+        scattered, stopped = scattered_light(self.scene, sampler, start, self.depths, active, *turned)
         return dr.select(shines, emitted, 0) + scattered, stopped
 
 
