@@ -18,14 +18,6 @@ import numpy as np
 #: Largest offset in small scenes, relative to their diagonal, in RayEpsilon.
 PART = 0.25
 
-#: How far beside the edges of meshes that light goes through to look, in units of the offset of rays that start there,
-#: times the cotangent of the angle between the faces: closer, rays through the mesh start beyond the other face.
-BEHIND = 8
-
-#: And beside lines in which meshes cut through each other: closer, rays start below the other surface where that
-#: overhangs.
-BESIDE_LINE = 2
-
 #: Least offset relative to the largest coordinate, in RayEpsilon: 64 units in the last place.
 LEAST = 64 / 1500
 

@@ -6,13 +6,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.rays import BEHIND, BESIDE_LINE
-
 from .edges import EdgeKind, Edges
 from .meshes import Geometry, lets_light_through
 
 #: Faces whose normals differ by less (sine of the angle) count as coplanar; vertex normals, as equal.
 COPLANAR = 1e-5
+
+#: How far beside the edges of meshes that light goes through to look, in units of the offset of rays that start there,
+#: times the cotangent of the angle between the faces: closer, rays through the mesh start beyond the other face.
+BEHIND = 8
+
+#: And beside lines in which meshes cut through each other: closer, rays start below the other surface where that
+#: overhangs.
+BESIDE_LINE = 2
 
 
 class DeviceEdges:

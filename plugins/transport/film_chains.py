@@ -277,7 +277,7 @@ class Chains:
         def step(vertex, derivative, seen, active):
             link = self.link(vertex, (derivative,), choice, active)
             found = link.seen
-            found.way = mi.sample_tea_32(seen.way, 8 * found.way + link.lobe)[0]
+            found.way = mi.sample_tea_32(seen.way, (found.way << 3) + link.lobe)[0]
             found.cells = mi.sample_tea_32(seen.cells, found.cells)[0]
             found.shown = mi.Bool(seen.shown)
             goes_on = active & (link.lobe > 0)
