@@ -47,7 +47,7 @@ class PathTracer:
     #: See `Scattering`.
     lights: LightChoice | None = None
 
-    #: Whose normals are turned on the sides of boundaries.
+    #: Whose normals are turned on the sides of boundaries: where paths are traced with detached values in a derivative.
     fine_mirrors: FineMirrors | None = None
 
     def __init__(self, scene: mi.Scene, integrator: mi.ad.common.ADIntegrator):
@@ -71,13 +71,11 @@ class PathTracer:
         attached: bool,
         horizon: Horizon | None = None,
         lune: Lune | None = None,
-        fine_mirrors: FineMirrors | None = None,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
 
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
         lune : see `Scattering.scatter`, for the first hit.
-        fine_mirrors : of which the normals are turned there.
         """
         scene = self.scene
         active = active & (self.depths.max_depth > 0)
@@ -89,8 +87,8 @@ class PathTracer:
         si = seen_by_camera(ray, pi, active, attached=attached)
         if horizon is not None:
             turn_to_side(si, ray, horizon)
-        if fine_mirrors is not None:
-            fine_mirrors.turn(si, ray, active)
+        if self.fine_mirrors is not None and not attached:
+            self.fine_mirrors.turn(si, ray, active)
         with dr.resume_grad(when=attached):
             if not self.hide_emitters:
                 L += si.emitter(scene).eval(si, active)
@@ -135,8 +133,7 @@ class PathTracer:
         self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None, lune: Lune | None
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, detached."""
-        turned = {"horizon": horizon, "lune": lune, "fine_mirrors": self.fine_mirrors}
-        found = self.radiance(ray, sampler, active, attached=False, **turned)
+        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, lune=lune)
         return found.L, dr.select(found.valid, mi.Float(1), 0)
 
     # ---------------------- From points of a path ----------------------
