@@ -1,4 +1,4 @@
-"""What is to be fitted, to what, and how: frozen dataclasses, which TOML files and the command line fill in."""
+"""The description of a fit: frozen dataclasses, which TOML files and the command line fill in."""
 
 from __future__ import annotations
 
@@ -33,153 +33,153 @@ class Target:
     """A picture that the scene should look like."""
 
     file: Path | None = None
-    """Picture: EXR, PNG or JPEG. Without one, the scene as its file has it is rendered, and is the truth."""
+    """Picture: EXR, PNG or JPEG. Without one, the unchanged scene file is rendered; its parameters are the truth."""
     scene: Path | None = None
-    """Scene that the picture shows, if not the one of the problem."""
+    """Scene that the picture shows. Default: the scene of the problem."""
     sensor: int = 0
-    """Number of the sensor that took it."""
+    """Number of the sensor that took the picture."""
     colour: Literal["auto", "linear", "srgb"] = "auto"
     """How its numbers relate to radiance. auto: EXR is linear, PNG and JPEG are sRGB."""
     alpha: bool = False
     """Weigh pixels by the alpha channel of the picture."""
     mask: Path | None = None
-    """Picture whose black pixels do not count."""
+    """Picture whose black pixels are left out of the loss."""
     resize: bool = False
-    """Resample a picture that has not the size of the film."""
+    """Resample the picture if its size is not that of the film."""
     spp: int = 4096
-    """Samples per pixel, where the target is rendered."""
+    """Samples per pixel of a target that is rendered."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Free:
-    """Something that may change. What its numbers mean depends on the parameter: `to_world`, and vertex positions if
-    `kind` is "pose", move as a rigid body; other vertex positions one by one; all else as it is."""
+    """A free parameter: one that the fit optimises. `to_world`, and vertex positions of the kind "pose", move as a
+    rigid body. Other vertex positions move one by one. Of all other parameters, the numbers themselves change."""
 
     key: tuple[str, ...]
-    """Parameters as `rimlight params` lists them. Several ones move together as a rigid body, or are fitted alike."""
+    """Parameters, as `rimlight params` lists them. Several keys move as one rigid body, or are fitted alike."""
     kind: Kind
-    """What it is. `rimlight fit KIND` fits those of one kind."""
+    """Kind of the parameter. `rimlight fit KIND` optimises the parameters of one kind."""
     rate: float = 0.01
-    """Length of the first steps: scene units for positions, the parameter's own otherwise."""
+    """Length of the first steps, in scene units for positions and in the unit of the parameter otherwise."""
     turn_rate: float | None = None
-    """Angle of the first steps of a rigid body, radians. Default: `rate` divided by its size."""
+    """Angle of the first steps of a rigid body, in radians. Default: `rate` divided by the size of the body."""
     move: str = "xyz"
     """World axes along which vertices or a rigid body may move."""
     turn: str = "xyz"
-    """World axes about which a rigid body may turn; it turns about its centre, a camera about its own."""
+    """World axes about which a rigid body may turn. A body turns about its centre, a camera about its own."""
     vertices: tuple[int, ...] = ()
     """Only these vertices are free. Default: all."""
     smoothing: float = 0
-    """λ of Mitsuba's large steps (Nicolet et al. 2021) for vertices; 0: none. Needs the package cholespy."""
+    """λ of Mitsuba's large steps (Nicolet et al. 2021) for vertices. 0: no smoothing. Needs the package cholespy."""
     lower: float | None = None
-    """Smallest legal value. Default: what the name of the parameter implies."""
+    """Smallest legal value. Default: the limit that the name of the parameter implies."""
     upper: float | None = None
-    """Largest legal value; likewise."""
+    """Largest legal value. Default: the limit that the name of the parameter implies."""
     unit_length: bool = False
-    """Its rows are directions, and kept at unit length."""
+    """Keep the rows of the parameter at unit length, because they are directions."""
     start: tuple[float, ...] = ()
-    """Where to start. For rigid bodies a displacement and a rotation vector in degrees, 6 numbers; for vertices a
-    displacement of each, or one for all; else the value, or one number for all. Default: what the scene has."""
+    """Where the fit starts. Rigid bodies: a displacement and a rotation vector in degrees, 6 numbers. Vertices: a
+    displacement of each, or one for all. Others: the value, or one number for all. Default: the value in the scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Loss:
-    """How much two pictures differ: the weighted mean over pixels and channels. Or what a neural network takes the
-    picture for."""
+    """Loss function: how much two pictures differ, as a weighted mean over pixels and channels; or, with `classifier`,
+    what a neural network sees in the picture."""
 
     norm: Literal["l1", "l2", "relative", "classifier"] = "l2"
-    """|d|, d², or d² / (t² + 0.01) with the target t. classifier: the logarithm of the probabilities of `fall` over
-    those of `rise`; nothing is compared, and the target is the scene as its file has it, for people. Needs the extra
-    `adversarial`."""
+    """l1: |d|, l2: d², relative: d² / (t² + 0.01), of the difference d and the target t. classifier: the logarithm of
+    the probabilities of `fall` over those of `rise`. It compares nothing: the target is the unchanged scene file, shown
+    to people. Needs the extra `adversarial`."""
     rise: dict[str, int] = dataclasses.field(default_factory=dict)
-    """Classes whose probability shall rise: label -> number, 0 … 999, of ImageNet."""
+    """Classes of ImageNet whose probability shall rise: label -> number, 0 … 999."""
     fall: dict[str, int] = dataclasses.field(default_factory=dict)
-    """Classes whose probability shall fall; likewise."""
+    """Classes of ImageNet whose probability shall fall: label -> number, 0 … 999."""
     pyramid: int = 0
-    """Levels of a Gaussian pyramid; the loss is the mean of theirs. 0: only the pictures themselves."""
+    """Levels of a Gaussian pyramid. The loss is the mean over the levels. 0: only the pictures themselves."""
     exclude_above: float | None = None
-    """Pixels whose target exceeds this radiance in any channel do not count."""
+    """Leave out pixels whose target exceeds this radiance in any channel."""
     channel: str | None = None
-    """What of the pictures of `aov_edge` is compared: the name of one of its channels, such as a depth map or a mask,
-    whose numbers the target holds as they are. Default: for integrators that render nothing but light."""
+    """Name of the channel of `aov_edge` that is compared, such as a depth map or a mask. The target holds its numbers
+    as they are. Default: none, for integrators that render nothing but light."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A part of the fit."""
+    """A stage of the fit, with a resolution and rates of its own."""
 
     iterations: int = 100
-    """Steps."""
+    """Number of steps."""
     resolution: int | None = None
-    """Width of the film, pixels. Default: that of the scene."""
+    """Width of the film, in pixels. Default: the width in the scene."""
     spp: int = 4
-    """Samples per pixel of the image, and as many of the derivative."""
+    """Samples per pixel of the image, and of the derivative as well."""
     rate: float = 1
-    """Factor of all rates at its begin."""
+    """Factor of all rates at the beginning of the stage."""
     decay: float = 1
-    """Factor of the rates at its end over those at its begin; between them they fall exponentially."""
+    """Rates at the end of the stage over those at its beginning. In between, they change exponentially."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Starts:
-    """Several starts, of which the best after the first stage goes on. The first is the start as given."""
+    """Several starts. The best one after the first stage continues. The first is the start as given."""
 
     count: int = 1
-    """How many."""
+    """Number of starts."""
     move: float = 0
-    """Standard deviation of displacements of rigid bodies along their free axes, scene units."""
+    """Standard deviation of displacements of rigid bodies along their free axes, in scene units."""
     turn: float = 0
-    """Standard deviation of their rotation vectors, degrees."""
+    """Standard deviation of the rotation vectors of rigid bodies, in degrees."""
     value: float = 0
-    """Standard deviation of other parameters, in their units."""
+    """Standard deviation of other parameters, in their own units."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """A fit, complete. Written to TOML and read from it without loss."""
+    """The complete description of a fit. It is written to TOML and read from it without loss."""
 
     scene: Path
     """Scene file of Mitsuba 3."""
     define: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Parameters of the scene file."""
+    """Values for parameters of the scene file, such as res."""
     target: tuple[Target, ...] = (Target(),)
-    """Pictures."""
+    """Pictures that the scene should look like."""
     free: tuple[Free, ...]
-    """What may change."""
+    """Free parameters, which the fit optimises."""
     loss: Loss = Loss()
-    """What is to be small."""
+    """Loss function."""
     stage: tuple[Stage, ...] = (Stage(),)
-    """One after the other."""
+    """Stages, one after the other."""
     starts: Starts = Starts()
-    """Where to begin."""
+    """Several starting points."""
     integrator: dict[str, Value] = dataclasses.field(default_factory=lambda: {"type": "prb_edge"})
-    """Plugin that renders and differentiates, with its parameters."""
+    """Integrator plugin that renders and differentiates, with its parameters."""
     optimiser: Literal["adam", "sgd"] = "adam"
-    """Mitsuba's. With sgd, `rate` is a factor of the gradient, not a length."""
+    """Optimiser of Mitsuba. With sgd, `rate` is a factor of the gradient, not a length."""
     momentum: float = 0.9
-    """Of sgd; the first decay rate of adam."""
+    """Momentum of sgd, and first decay rate of adam."""
     smooth_scale: float = 0.99
-    """The second decay rate of adam."""
+    """Second decay rate of adam."""
     clip: float | None = None
-    """Longest gradient of one parameter, as a multiple of the median of its last 50 lengths."""
+    """Longest gradient of one parameter, as a multiple of the median of its last 50 lengths. Default: no limit."""
     parts: int = 1
-    """Independent renders of each target in a step, whose losses and gradients are averaged: work for several
-    processes or machines."""
+    """Number of independent renders of each target in a step. Their losses and gradients are averaged. Several
+    processes or machines can share them."""
     seed: int = 0
-    """Of all random numbers."""
+    """Random seed."""
     patience: int | None = None
-    """End a stage whose loss has not fallen by 0.1 % for so many steps. Default: never."""
+    """End a stage if its loss has not fallen by 0.1 % within this many steps. Default: never."""
     seconds: float | None = None
-    """End the fit after this time."""
+    """End the fit after this many seconds. Default: no limit."""
     max_bad: int = 20
-    """Give up after so many gradients in a row that are not finite. Each is skipped, and counted."""
+    """End the fit after this many gradients in a row that are not finite. Each is skipped and counted."""
     freeze: bool = True
-    """Record the step once and replay it, where integrator and sensor allow that."""
+    """Record the step once and replay it, where the integrator and the sensor allow that."""
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
     threads: int | None = None
     """Threads of this process. With 1, a fit that is repeated or resumed ends with the same numbers, bit by bit.
-    Default: all."""
+    Default: one for each core."""
 
     def __post_init__(self) -> None:
         check(self)

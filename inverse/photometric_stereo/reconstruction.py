@@ -44,20 +44,20 @@ class Options:
     """
 
     start: Literal["least squares", "trimmed", "reweighted"] = "trimmed"
-    """Normals at the start."""
+    """Method that finds the normals at the start."""
     reflectance: bool = True
-    """Fit the BSDF. Otherwise the surface is Lambertian, and only its colour is fitted."""
+    """Fit the BSDF. Otherwise, the surface is taken to be Lambertian, and only its colour is fitted."""
     coat: bool | None = None
-    """May light be diffuse under a smooth coat, as that of plastics? Default: if that predicts better."""
+    """Diffuse light comes from under a smooth coat, as in plastics. Default: what predicts better."""
     materials: Literal["one", "several"] | None = None
-    """One material, with a factor for each pixel; or several under one glaze: a diffuse colour for each pixel, and
-    highlights that all share. Default: what predicts better."""
+    """one: one material, with a factor for each pixel. several: several materials under one glaze, with a diffuse
+    colour for each pixel and highlights that all pixels share. Default: what predicts better."""
     albedo: bool = True
-    """A factor of the BSDF for each pixel."""
+    """Fit a factor of the BSDF for each pixel. Otherwise, the material has no texture."""
     exposures: bool = True
     """Estimate the exposure of each image."""
     dark: float = 0.2
-    """Part of the values of each pixel, the darkest, that do not count."""
+    """Fraction of the values of each pixel that is left out: the darkest ones."""
     shadows: bool = True
     """Leave out values in shadows that the surface itself casts."""
     max_depth: int = 3
@@ -65,22 +65,23 @@ class Options:
     spp: int = 8
     """Samples per pixel of interreflections."""
     smoothing: float = 1.5
-    """Interreflections are smoothed over so many pixels (standard deviation), since normals inherit their noise."""
+    """Smoothing of interreflections, whose noise the normals would inherit: standard deviation in pixels."""
     resolutions: tuple[float, ...] = (0.25, 0.5, 1.0)
     """Sizes of the images, relative to the data."""
     iterations: tuple[int, ...] = (10, 6, 4)
-    """Alternations at each of them, at most."""
+    """Largest number of alternations at each of the resolutions."""
     tolerance: float = 0.02
-    """Alternations end when normals turn by less than this in the mean, degrees."""
+    """Alternations end when normals turn by less than this on average, in degrees."""
     descent: Descent = dataclasses.field(default_factory=Descent)
     """Steps along derivatives of path-traced images, after the last alternation."""
     bilateral: float | None = None
     """Sharpness of discontinuities of depth; see `integrate`."""
     brightness: float = 0.6
-    """Albedo of the brightest colour of a median pixel, where the scale of the images is unknown: from it follow the
-    interreflections. 0: the scale is known, values are radiances under lights of irradiance 1 (times intensity)."""
+    """Albedo of the brightest colour of a median pixel. It sets the unknown scale of the images, on which the
+    interreflections depend. 0: the scale is known, and values are radiances under lights of irradiance 1 (times
+    intensity)."""
     seed: int = 0
-    """Of all random numbers."""
+    """Random seed."""
 
     def __post_init__(self):
         if len(self.resolutions) != len(self.iterations) or not self.resolutions:

@@ -39,22 +39,22 @@ class Descent:
     """
 
     steps: int = 0
-    """How many."""
+    """Number of steps."""
     spp: int = 1
     """Samples per pixel of the images and of their derivatives."""
     lights: int = 0
-    """Of lights at infinity, use so many, at random, at each step. 0: all."""
+    """Number of distant lights that each step uses, chosen at random. 0: all."""
     adaptive: bool = True
-    """Derivatives are sampled where images differ most."""
+    """Sample derivatives where the images differ most."""
     rate: float = 0.002
-    """Of normals, radians a step at the start; falls to a tenth."""
+    """Rate of normals, in radians per step at the start. It falls to a tenth."""
     bsdf_rate: float = 0.05
-    """Of the logarithms of the BSDF's weights; likewise."""
+    """Rate of the logarithms of the weights of the BSDF, per step at the start. It falls to a tenth."""
     depth_rate: float = 0.0
-    """Of depth, pixels a step (likewise), with the shadows that the surface casts differentiated. 0: depth is only
-    integrated from the normals."""
+    """Rate of depth, in pixels per step at the start, which falls to a tenth. The shadows that the surface casts are
+    differentiated. 0: depth is only integrated from the normals."""
     integrability: float = 0.002
-    """Where depth descends: by which part normals turn towards those of the depth at each step."""
+    """If depth descends: fraction by which normals turn towards those of the depth at each step."""
 
     def __post_init__(self):
         rates = self.rate, self.bsdf_rate, self.depth_rate, self.integrability

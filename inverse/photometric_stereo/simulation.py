@@ -70,11 +70,11 @@ class Options:
     weights of a `ggx_dictionary`, .json; or the name of one of its materials. Several with | between them: regions of
     equal areas, which differ from seed to seed."""
     lights: int = 96
-    """How many."""
+    """Number of lights."""
     spread: float = 55.0
     """Largest angle between a light and the direction to the camera, degrees."""
     led_distance: float = 0.0
-    """Of LEDs from the middle of the object, over the width of the image; needs --focal. 0: lights at infinity."""
+    """Distance of LEDs from the middle of the object, over the width of the image. Needs --focal. 0: distant lights."""
     focal: float = 0.0
     """Focal length of the camera, over the width of the image. 0: an orthographic camera."""
     size: int = 128
@@ -84,9 +84,9 @@ class Options:
     spp: int = 64
     """Samples per pixel."""
     noise: float = 0.0
-    """Standard deviation of noise, over the median value."""
+    """Standard deviation of the noise, over the median value."""
     seed: int = 0
-    """Of the random numbers."""
+    """Random seed."""
 
     def __post_init__(self):
         left, bottom, right, top, back = self.crop

@@ -25,7 +25,7 @@ from ._shared import REFUSAL, OnMotion, OnScene, OnSensor, accumulate, progress,
 
 @dataclass(frozen=True)
 class SysInfo:
-    """Print versions, hardware, and what works here."""
+    """Print the versions, the hardware, and what works on this machine."""
 
     def run(self) -> int:
         from rimlight.sys_info import print_sys_info
@@ -36,7 +36,7 @@ class SysInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class Params(OnScene):
-    """List the parameters of a scene that can be differentiated: ∂, and D where they move edges."""
+    """List the parameters of a scene. ∂ marks those that can be differentiated, D those that also move edges."""
 
     def run(self) -> int:
         rows = [("parameter", "type", "size", "flags")]
@@ -51,12 +51,12 @@ class Params(OnScene):
 
 @dataclass(frozen=True, kw_only=True)
 class PlanCommand(OnSensor):
-    """Print what a derivative needs: which terms, of how many edges, at what cost."""
+    """Print what a derivative needs: which terms, how many edges, how many rays; and what it will lack."""
 
     param: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KEY")] = ()
-    """Parameter that moves; `rimlight params` lists them. May be repeated. Default: the camera and all vertices."""
+    """Parameter that changes, as `rimlight params` lists it. May be repeated. Default: the camera and all vertices."""
     integrator: str = "prb_edge"
-    """Plugin that renders: direct_edge or prb_edge."""
+    """Integrator that renders: direct_edge or prb_edge."""
     spp: int = 16
     """Samples per pixel."""
 
@@ -81,9 +81,9 @@ class Render(OnSensor):
     """Render a scene to an EXR and a PNG file."""
 
     out: Path
-    """Folder for image.exr and image.png, or name of the EXR file."""
+    """Folder for image.exr and image.png, or the name of the EXR file."""
     integrator: str = "direct_edge"
-    """Plugin that renders."""
+    """Integrator plugin that renders."""
     spp: int = 64
     """Samples per pixel."""
 
@@ -115,7 +115,7 @@ class Gradient(OnMotion):
     out: Path
     """Folder for image.exr, image.png, derivative.exr and derivative.png."""
     integrator: str = "direct_edge"
-    """Plugin that differentiates."""
+    """Integrator plugin that differentiates."""
     spp: int = 256
     """Samples per pixel."""
 
@@ -156,11 +156,11 @@ class FiniteDifferencesCommand(OnMotion):
     """Render a reference derivative by central differences of Mitsuba's `path`."""
 
     out: Path
-    """EXR file to write; its layer `standard_error` says how far to trust it."""
+    """EXR file to write. Its layer `standard_error` holds the noise of each pixel."""
     step: float
-    """Step h of (I(+h) - I(-h)) / 2h. Choose it to move the image by a few hundredths of a pixel."""
+    """Step h of (I(+h) - I(-h)) / 2h. Choose it such that the image moves by a few hundredths of a pixel."""
     runs: int = 32
-    """Independent runs, at least 2."""
+    """Number of independent runs, at least 2."""
     spp: int = 4096
     """Samples per pixel of each image."""
     max_depth: int = 2
@@ -186,26 +186,26 @@ class FiniteDifferencesCommand(OnMotion):
 
 @dataclass(frozen=True, kw_only=True)
 class Check(OnMotion):
-    """Compare a derivative with finite differences. Exit code 1 where they disagree by more than their noise."""
+    """Compare a derivative with finite differences. The exit code is 1 if they disagree by more than their noise."""
 
     step: float
-    """Step h of the finite differences."""
+    """Step h of the finite differences. Choose it such that the image moves by a few hundredths of a pixel."""
     integrator: str = "direct_edge"
-    """Plugin that differentiates."""
+    """Integrator plugin that differentiates."""
     spp: int = 64
     """Samples per pixel of one derivative."""
     seeds: int = 16
-    """Derivatives to average, at least 2; their spread gives the standard error."""
+    """Number of derivatives to average, at least 2. Their spread gives the standard error."""
     runs: int = 16
-    """Independent runs of the finite differences, at least 2."""
+    """Number of independent runs of the finite differences, at least 2."""
     fd_spp: int = 1024
     """Samples per pixel of each image of the finite differences."""
     max_depth: int = 2
     """`max_depth` of the `path` integrator that the finite differences use."""
     tolerance: float = 0.01
-    """How far the finite differences may be off because of their step, relative to the derivative."""
+    """Error that the step of the finite differences may cause, relative to the derivative."""
     out: Annotated[Path | None, arg(metavar="FILE.png")] = None
-    """Picture of both and their difference."""
+    """Picture to write, with the derivative, the finite differences, and their difference."""
 
     def run(self) -> int:
         at_least(1, spp=self.spp, fd_spp=self.fd_spp, max_depth=self.max_depth)
@@ -273,7 +273,7 @@ class Check(OnMotion):
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
-    """Make a page with derivative images and a fit, about a minute's work."""
+    """Make a page with derivative images and a fit. Takes about a minute."""
 
     out: Path = Path("demo")
     """Folder for index.html and the pictures."""
@@ -290,22 +290,22 @@ class Demo:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Fit pose, material, light or shape to pictures, as a TOML file says."""
+    """Fit pose, material, light or shape to pictures, as described by a TOML file."""
 
 
 @dataclass(frozen=True)
 class _Reproduce:
-    """Run the fits of Li et al. 2018 (figures 1 and 6), with a report of each and a table of all."""
+    """Run the fits of Li et al. 2018 (figures 1, 6 and 10). Writes a report of each and prints a table of all."""
 
 
 @dataclass(frozen=True)
 class _Reflectance:
-    """Fit weights of lobes to measured reflectance, or choose the lobes."""
+    """Fit the weights of lobes to measured reflectance, or choose the lobes."""
 
 
 @dataclass(frozen=True)
 class _Ps:
-    """Photometric stereo: shape and reflectance from images under many lights."""
+    """Photometric stereo: find shape and reflectance from images under many lights."""
 
 
 def commands(argv: Sequence[str]) -> dict[str, type]:

@@ -26,18 +26,18 @@ EXAMPLE = Problem(scene=Path("scene.xml"), free=(Free(key=("shape.vertex_positio
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Fit pose, material, light or shape to pictures, as a TOML file says."""
+    """Fit pose, material, light or shape to pictures, as described by a TOML file."""
 
     kind: Positional[Literal["pose", "material", "light", "shape", "joint"]]
-    """Fit the free parameters of this kind, or all."""
+    """joint optimises every free parameter. The others optimise one kind and keep the other parameters fixed."""
     config: Annotated[Positional[Path], arg(metavar="CONFIG.TOML")]
-    """The problem. Each of its entries is an option here, too."""
+    """File that describes the problem. Each of its entries is also an option of this command."""
     out: Path
-    """Folder for the report, the result and checkpoints."""
+    """Folder for the report, the result and the checkpoints."""
     resume: bool = False
-    """Go on from the checkpoint in that folder."""
+    """Continue from the checkpoint in that folder."""
     workers: int = 0
-    """Processes to share the work. 0: none but this one."""
+    """Number of processes that share the work. 0: this process does all of it."""
     cluster: str | None = None
     """Address of the scheduler of a Dask cluster, or "local"."""
     tensorboard: bool = False
@@ -111,16 +111,16 @@ def command(argv: Sequence[str]) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
-    """Run the fits of Li et al. 2018 (figures 1, 6 and 10), with a report of each and a table of all."""
+    """Run the fits of Li et al. 2018 (figures 1, 6 and 10). Writes a report of each and prints a table of all."""
 
     figure: Positional[Literal["fig1", "fig6a", "fig6b", "fig6c", "fig6d", "fig6e", "fig6f", "fig6", "fig10", "all"]]
-    """Which."""
+    """Figure to reproduce, or one of its parts, or all."""
     out: Path
-    """Folder for the reports. What is there already is not made again."""
+    """Folder for the reports. Fits that are in it already are not repeated."""
     seeds: int = 1
-    """How many seeds."""
+    """Number of random seeds. Each fit runs once for each seed."""
     peer: bool = False
-    """Fit with Mitsuba's prb_projective, too, for as long."""
+    """Run each fit also with Mitsuba's prb_projective, for as long as Rimlight's took."""
 
     def run(self) -> int:
         from rimlight.inverse import reproduce

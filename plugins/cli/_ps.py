@@ -42,17 +42,17 @@ class Run:
     """Reconstruct normals, depth and reflectance of a data set."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """Images, lights and a mask, in the layout of DiLiGenT."""
+    """Folder with images, lights and a mask, in the layout of DiLiGenT."""
     out: Path
     """Folder for the results and the checkpoint."""
     resume: bool = False
-    """Go on from the checkpoint in that folder."""
+    """Continue from the checkpoint in that folder."""
     images: int = 0
-    """Use so many of the images, evenly from their list. 0: all."""
+    """Use only this many of the images, spread evenly over their list. 0: all."""
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
     threads: int = 0
-    """Threads of Dr.Jit. 0: as many as there are cores. With 1, equal runs have equal results, bit by bit."""
+    """Threads of Dr.Jit. 0: one for each core. With 1, repeated runs have the same result, bit by bit."""
     options: Annotated[reconstruction.Options, arg(name="")] = field(default_factory=reconstruction.Options)
 
     def run(self) -> int:
@@ -142,7 +142,7 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Make a data set with a known truth, by path tracing."""
+    """Make a data set whose true shape is known, by path tracing."""
 
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Folder for the data set."""
@@ -165,14 +165,14 @@ class Simulate:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate:
-    """Find the directions of lights from pictures of a ball."""
+    """Find the directions of lights from pictures of a ball; a matte one also tells their intensities."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """Pictures of a ball, one for each light. The lights are written there."""
+    """Folder with pictures of a ball, one for each light. The lights are written into it."""
     ball: Path
-    """Mask of the ball, a picture."""
+    """Picture that is the mask of the ball."""
     kind: Literal["chrome", "matte"]
-    """Of ball: a mirror; or a Lambertian one, which tells intensities, too."""
+    """chrome: the ball is a mirror. matte: it is Lambertian, which also tells the intensities of the lights."""
 
     def run(self) -> int:
         use_variant("llvm_ad_rgb")
@@ -185,12 +185,12 @@ class Calibrate:
 
 @dataclass(frozen=True, kw_only=True)
 class Inspect:
-    """Look at a data set before it is reconstructed: write a page, and print what it is like."""
+    """Check a data set before it is reconstructed: print a table and warnings, and write a page with pictures."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """Images, lights and a mask, in the layout of DiLiGenT."""
+    """Folder with images, lights and a mask, in the layout of DiLiGenT."""
     out: Path = Path("inspection.html")
-    """The page."""
+    """HTML page to write."""
 
     def run(self) -> int:
         check_output(self.out, folder=False)
@@ -216,7 +216,7 @@ Command = (
 
 @dataclass(frozen=True, kw_only=True)
 class Ps:
-    """Photometric stereo: shape and reflectance from images under many lights."""
+    """Photometric stereo: find shape and reflectance from images under many lights."""
 
     command: OmitSubcommandPrefixes[Command]
 

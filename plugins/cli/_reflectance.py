@@ -20,14 +20,14 @@ from ._shared import REFUSAL
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Fit the weights of a dictionary to a table; for the plugin `ggx_dictionary`."""
+    """Fit the weights of a dictionary of lobes to a table. The result is for the plugin `ggx_dictionary`."""
 
     table: Annotated[Positional[Path], arg(metavar="TABLE.binary")]
     """Table in the format of the MERL database."""
     out: Annotated[Positional[Path], arg(metavar="OUT.json")]
-    """File to write: lobes and weights."""
+    """File to write, with lobes and weights."""
     dictionary: Annotated[Path, arg(metavar="FILE.json")] = ggx.SHIPPED
-    """Dictionary to use, as `rimlight reflectance reduce` writes them. Default: that of the package."""
+    """Dictionary of lobes, as `rimlight reflectance reduce` writes it. Default: the dictionary of the package."""
 
     def run(self) -> int:
         check_output(self.out, folder=False, option="OUT.json")
@@ -44,26 +44,26 @@ class Fit:
 
 @dataclass(frozen=True, kw_only=True)
 class Reduce:
-    """Choose the lobes that describe the tables of a folder best. Prints the errors of its materials."""
+    """Choose the lobes that describe the tables of a folder best. Prints the error of each material."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """Tables in the format of the MERL database: all of its files *.binary."""
+    """Folder with tables in the format of the MERL database. All files *.binary are used."""
     out: Annotated[Positional[Path], arg(metavar="OUT.json")]
-    """File to write: the lobes, and the weights of each material."""
+    """File to write, with the lobes and the weights of each material."""
     lobes: int = 40
-    """Lobes to keep."""
+    """Number of lobes to keep."""
     alphas: int = 12
-    """Different alphas to keep, at most. The fewer, the cheaper."""
+    """Largest number of different alphas to keep. Fewer are cheaper to evaluate."""
     etas: int = 8
-    """Different etas to keep, at most. The fewer, the cheaper."""
+    """Largest number of different etas to keep. Fewer are cheaper to evaluate."""
     alpha_range: tuple[float, float] = (0.003, 1.0)
-    """Smallest and largest alpha to choose from."""
+    """Smallest and largest alpha of the candidates."""
     eta_range: tuple[float, float] = (1.05, 100.0)
-    """Smallest and largest eta to choose from."""
+    """Smallest and largest eta of the candidates."""
     candidates: tuple[int, int] = (50, 40)
-    """Alphas and etas to choose from."""
+    """Number of alphas and of etas of the candidates."""
     diffuse: bool = True
-    """Choose from these and diffuse lobes, Lambertian and under a coat?"""
+    """Add diffuse lobes to the candidates, Lambertian and under a coat."""
 
     def run(self) -> int:
         at_least(1, lobes=self.lobes, alphas=self.alphas, etas=self.etas, candidates=min(self.candidates))
@@ -96,7 +96,7 @@ Command = Annotated[Fit, subcommand("fit")] | Annotated[Reduce, subcommand("redu
 
 @dataclass(frozen=True, kw_only=True)
 class Reflectance:
-    """Fit weights of lobes to measured reflectance, or choose the lobes."""
+    """Fit the weights of lobes to measured reflectance, or choose the lobes."""
 
     command: OmitSubcommandPrefixes[Command]
 

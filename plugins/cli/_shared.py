@@ -44,7 +44,7 @@ class OnScene:
     scene: Annotated[Positional[Path], arg(metavar="SCENE.XML")]
     """Scene file of Mitsuba 3."""
     define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=["-D"], metavar="KEY=VALUE")] = ()
-    """Parameter of the scene file, such as res=128."""
+    """Set a parameter of the scene file, such as res=128. May be repeated."""
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
 
@@ -56,9 +56,9 @@ class OnScene:
 @dataclass(frozen=True, kw_only=True)
 class OnSensor(OnScene):
     sensor: int = 0
-    """Number of the sensor."""
+    """Number of the sensor in the scene, from 0."""
     seed: int = 0
-    """Seed of the random numbers."""
+    """Random seed."""
 
     def load(self) -> Any:
         at_least(0, sensor=self.sensor, seed=self.seed)
@@ -80,17 +80,17 @@ class OnSensor(OnScene):
 @dataclass(frozen=True, kw_only=True)
 class OnMotion(OnSensor):
     param: Annotated[str | None, arg(metavar="KEY")] = None
-    """Parameter that moves; `rimlight params` lists them."""
+    """Parameter that changes, as `rimlight params` lists it."""
     camera: Literal["translate", "rotate"] | None = None
-    """Move the camera instead."""
+    """Move the camera instead of a parameter."""
     direction: Numbers = None
-    """Displacement per unit of θ, world space. For colours etc.: as many numbers as the parameter has, or one."""
+    """Displacement per unit of θ, in world space. For colours etc.: as many numbers as the parameter has, or one."""
     rotate: Numbers = None
-    """Axis of a rotation, world space; θ in radians."""
+    """Axis of a rotation, in world space. θ is in radians."""
     pivot: Numbers = None
-    """Point on that axis (default: the mean of the vertices, or the origin of what moves)."""
+    """Point on that axis. Default: the mean of the vertices, or the origin of what moves."""
     vertices: Annotated[str | None, arg(metavar="I,J,...")] = None
-    """Only these vertices move."""
+    """Move only these vertices. Default: all."""
 
     def load_motion(self, scene: Any) -> Motion:
         return _loading.load_motion(
