@@ -32,7 +32,8 @@ class DeviceEdges:
     DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "any_smooth", "any_farther", "_any_split", *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
-        index = lambda a: mi.UInt32(np.ascontiguousarray(a))
+        # Copied, since Dr.Jit maps NumPy's memory: two arrays on the same memory make `dr.freeze` record anew.
+        index = lambda a: mi.UInt32(np.array(a))
         self.count = len(edges)
         self._ends = [[index(edges.vertices[:, side, k]) for k in (0, 1)] for side in (0, 1)]
         self._opposite = [index(edges.opposite[:, side]) for side in (0, 1)]
@@ -41,7 +42,7 @@ class DeviceEdges:
         #: Are there edges with interpolated normals?
         self.any_smooth = not self._kinds.isdisjoint({EdgeKind.SMOOTH, EdgeKind.SPLIT})
         self._two_faces = mi.Bool(edges.count == 2)
-        self._is_line = mi.Bool(edges.is_line)
+        self._is_line = mi.Bool(np.array(edges.is_line))
         transmit = np.array([lets_light_through(m) for m in geometry.meshes])
         farther = np.where(edges.is_line, BESIDE_LINE, BEHIND * transmit[edges.mesh].any(1))
         self._farther = mi.Float(np.float32(farther))
