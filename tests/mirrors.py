@@ -127,6 +127,15 @@ def leaf() -> mi.Scene:
     return board(type="mask", opacity=opacity, nested=leaf)
 
 
+def veil() -> mi.Scene:
+    """A plate that lets through more light here than there, and a mirror behind it, which shows it."""
+    opacity = {"type": "checkerboard", "color0": 0.3, "color1": 0.9, "to_uv": mi.ScalarTransform3f().scale([3, 2])}
+    veil = {"type": "mask", "opacity": opacity, "nested": diffuse(0.2, 0.7, 0.1, two_sided=True)}
+    wall = quad((-2, -1, 1.1), (0, 3, 0), (4, 0, 0.4), "mirror", bsdf={"type": "conductor"})
+    plate = patterned("rectangle", at=(0.03, 0.1, 0), **veil)
+    return scene(sensor=camera((0.6, 1.4, -3.4), (0, 0, 0)), board=plate, mirror=wall, sky=constant(0.6), lamp=lamp())
+
+
 def bumps() -> mi.Scene:
     heights = texels(1, seed=4, size=(6, 6))
     heights["filter_type"] = "bilinear"
@@ -167,6 +176,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "checkerboard_camera": (checkerboard, CAMERA, 2e-3, 3),
     "nearest_texels": (nearest, BOARD, 2e-3, 2),
     "leaf": (leaf, LEAF, 2e-3, 3),
+    "veil_and_mirror": (veil, LEAF, 2e-3, 4),
     "bumps": (bumps, BOARD, 2e-3, 2),
     "checkered_ball": (checkered_ball, BALL, 2e-3, 3),
 }

@@ -223,6 +223,8 @@ class Chains:
 
     def __init__(self, tracer: PathTracer, rays: FilmRays, mirrors: bool, textures: TextureLines | None):
         self.tracer, self.rays, self.mirrors, self.textures = tracer, rays, mirrors, textures
+        bsdfs = [s.bsdf().flags() for s in tracer.scene.shapes() if s.bsdf() is not None]
+        self._any_mask = mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
 
     def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:
         """What the camera sees at u."""
@@ -242,9 +244,18 @@ class Chains:
             self.tracer.fine_mirrors.turn(si, ray, met)
         numbers = Numbers(mi.Point2f(0), mi.sample_tea_float32(choice, vertex.depth), mi.Point2f(0.5))
         goes_on = met & self.tracer.scatters(vertex.depth) & self.mirrors
-        bs, weight = si.bsdf(ray).sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, goes_on)
+        bsdf = si.bsdf(ray)
+        mask = self._is_mask(bsdf) & goes_on
+        enters = numbers.lobe < 0.5
+        numbers.lobe = dr.select(mask, dr.select(enters, dr.one_minus_epsilon(mi.Float), 0), numbers.lobe)
+        bs, weight = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, goes_on)
+        if self._any_mask:
+            let_through = mi.UInt32(int(mi.BSDFFlags.Null))
+            bs.sampled_type = dr.select(mask, dr.select(enters, let_through, 0), bs.sampled_type)
+            bs.wo, bs.eta = dr.select(mask, -si.wi, bs.wo), dr.select(mask, 1, bs.eta)
+            weight = dr.select(mask, 2 * bsdf.eval_null_transmission(si, mask), weight)
         mirrored, through = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
-        goes_on &= mirrored & dr.any(weight != 0)
+        goes_on &= mirrored & (mask | dr.any(weight != 0))
         next_ray = spawn_ray(scene, si, si.to_world(bs.wo))
         next_pi = scene.ray_intersect_preliminary(next_ray, active=goes_on)
         onwards = Next(next_ray, next_pi, weight, bs.eta, goes_on & through, mirrored, mirrored)
@@ -267,6 +278,19 @@ class Chains:
             mi.Bool(False),
         )
         return Link(seen, onwards, beyond, lobe, numbers)
+
+    def _is_mask(self, bsdf: mi.BSDFPtr) -> mi.Bool:
+        """Does light go through it in part, while the rest is scattered?
+
+        Every second chain goes through, whatever the opacity is: otherwise, chains on both sides of a line at which
+        that jumps would take different ways, and not be compared.
+        """
+        if not self._any_mask:
+            return mi.Bool(False)
+        flags = bsdf.flags()
+        has = lambda flag: mi.has_flag(flags, flag)
+        mirror = has(mi.BSDFFlags.DeltaReflection) | has(mi.BSDFFlags.DeltaTransmission)
+        return has(mi.BSDFFlags.Null) & has(mi.BSDFFlags.Smooth) & ~mirror
 
     def end(self, u: mi.Point2f, axis: mi.Vector2f, choice: mi.UInt32, active: mi.Bool) -> Seen:
         """What the chain from u ends at.
