@@ -21,12 +21,26 @@ PART = 0.25
 #: Least offset relative to the largest coordinate, in RayEpsilon: 64 units in the last place.
 LEAST = 64 / 1500
 
+#: How far above a surface rays start that go through it as if nothing was there, relative to the largest coordinate or
+#: the size of the scene, in RayEpsilon: 16 units in the last place. And least cosine by which that is divided.
+THROUGH, STEEPEST = 16 / 1500, 0.01
 
-def spawn_ray(scene: mi.Scene, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Ray3f:
-    """The ray that leaves `si` in the direction d, as Mitsuba's `spawn_ray`."""
+
+def spawn_ray(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, d: mi.Vector3f, through: mi.Bool | bool = False
+) -> mi.Ray3f:
+    """The ray that leaves `si` in the direction d, as Mitsuba's `spawn_ray`.
+
+    through : does it go through the surface as if nothing was there? Then it starts on the line of the ray that met the
+        surface, and closer to it: Mitsuba's starts beside that line, and shows edges where they are not on the film.
+    """
     ray = si.spawn_ray(d)
     if _is_small(scene):
         ray.o = _start(scene, si, d)
+    if through is not False:
+        with dr.suspend_grad():
+            along = lift_beyond(scene, si.p) / dr.maximum(dr.abs_dot(si.n, d), STEEPEST)
+        ray.o = dr.select(through, dr.fma(d, along, si.p), ray.o)
     return ray
 
 
@@ -48,6 +62,13 @@ def lift(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
     if _is_small(scene):
         usual = dr.maximum(dr.minimum(usual, PART * _size(scene)), LEAST * reach)
     return usual * mi.math.RayEpsilon
+
+
+def lift_beyond(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
+    """`lift` of rays that go through the surface as if nothing was there."""
+    size, _ = extent(scene)
+    reach = dr.maximum(dr.max(dr.abs(p)), _size(scene)) if np.isfinite(size) else np.inf
+    return dr.minimum(lift(scene, p), THROUGH * mi.math.RayEpsilon * reach)
 
 
 def _start(scene, si, d) -> mi.Point3f:

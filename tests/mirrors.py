@@ -1,4 +1,5 @@
-"""Perfect mirrors, glass, and textures that jump: what `cases.py` has of jumps that are found by bisection."""
+"""Perfect mirrors, glass, textures that jump, and maps whose normals turn away: what `cases.py` has of jumps that are
+found by bisection."""
 
 from __future__ import annotations
 
@@ -68,10 +69,16 @@ def mirrored_ball() -> mi.Scene:
     return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), cube=cube((-0.9, 0.5, -0.6), 0.3), sky=constant(0.5))
 
 
-def smooth_mirror() -> mi.Scene:
-    """A smooth-shaded mirror of few triangles."""
-    vertices, _, _, faces = ball(10)
-    shape = mesh("ball", 0.6 * vertices + [0, 0.4, 0.3], faces, normals=True, bsdf={"type": "conductor"})
+def smooth_mirror(textured: bool = False, flipped: bool = False) -> mi.Scene:
+    """A smooth-shaded mirror of few triangles.
+
+    textured, flipped : with texture coordinates, and with its normals turned round? The image is the same.
+    """
+    vertices, _, uv, faces = ball(10)
+    bsdf = {"type": "twosided", "nested": {"type": "conductor"}} if flipped else {"type": "conductor"}
+    props = {"bsdf": bsdf, **({"flip_normals": True} if flipped else {})}
+    uv = uv * [3, -2] if textured else None
+    shape = mesh("ball", 0.6 * vertices + [0, 0.4, 0.3], faces, normals=True, uv=uv, **props)
     at = camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35)
     return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), sky=constant(0.5))
 
@@ -151,6 +158,37 @@ def checkered_ball() -> mi.Scene:
     return scene(sensor=at, ball=thing, mirror=floor, sky=constant(0.4), lamp=lamp())
 
 
+# ---------------------- Maps whose normals turn away ----------------------
+
+
+def mapped(kind: str, seed: int = 1, **texture: Any) -> dict:
+    """Normals that lean by up to 30 degrees, or as steep heights."""
+    rng = np.random.default_rng(seed)
+    data = rng.uniform(0, 0.45, (6, 6, 1))
+    if kind == "normalmap":
+        data = np.concatenate([rng.uniform(-0.4, 0.4, (5, 7, 2)), np.ones((5, 7, 1))], 2)
+        data = 0.5 + 0.5 * data / np.linalg.norm(data, axis=2, keepdims=True)
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(data.astype(np.float32)), "raw": True, **texture}
+    return {"type": kind, "normalmap": texture, "nested": diffuse(0.8, 0.5, 0.3)}
+
+
+def in_the_light_of_a_point(shape: Any) -> mi.Scene:
+    point = {"type": "point", "position": [1, 3, -3], "intensity": {"type": "rgb", "value": 10.0}}
+    return scene(sensor=camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35), ball=shape, point=point)
+
+
+def mapped_ball() -> mi.Scene:
+    vertices, _, uv, faces = ball(20)
+    bsdf = mapped("normalmap", wrap_mode="clamp")
+    return in_the_light_of_a_point(mesh("ball", 0.7 * vertices + [0, 0.4, 0.3], faces, normals=True, uv=uv, bsdf=bsdf))
+
+
+def bumpy_ball() -> mi.Scene:
+    bsdf = {**mapped("bumpmap"), "scale": 1.0}
+    ball = {"type": "sphere", "id": "ball", "center": [0, 0.4, 0.3], "radius": 0.7, "bsdf": bsdf}
+    return in_the_light_of_a_point(ball)
+
+
 SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0.4]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
 MIRROR = {"key": "mirror.vertex_positions", "rotate": [0.6, 0.2, 1]}
@@ -158,6 +196,7 @@ CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.4]}
 BALL = {"key": "ball.to_world", "direction": [1, 0.3, 0.4]}
 MESH = {"key": "ball.vertex_positions", "direction": [1, 0.3, 0.4]}
 BOARD = {"key": "board.to_world", "rotate": [0.3, 1, 0.2]}
+MAP = {"key": "ball.bsdf.normalmap.data", "direction": [1]}
 LEAF = {"key": "board.to_world", "direction": [1, 0.3, 0.4]}
 
 #: Of each case: scene, motion, step, max_depth.
@@ -179,4 +218,8 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "veil_and_mirror": (veil, LEAF, 2e-3, 4),
     "bumps": (bumps, BOARD, 2e-3, 2),
     "checkered_ball": (checkered_ball, BALL, 2e-3, 3),
+    "mapped_ball": (mapped_ball, MESH, 2e-3, 2),
+    "mapped_ball_camera": (mapped_ball, CAMERA, 2e-3, 2),
+    "mapped_ball_map": (mapped_ball, MAP, 2e-3, 2),
+    "bumpy_ball": (bumpy_ball, BALL, 2e-3, 2),
 }

@@ -24,7 +24,6 @@ from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import inside_frame
-from rimlight.edge_sampling.rays import lift
 
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
@@ -222,8 +221,8 @@ class FilmBoundary:
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = 8 * ulp * largest
         if self.outlines.edges is not None and self.outlines.edges.any_farther:
-            farther = self.outlines.edges.farther(at.positions, chosen.edge)
-            in_world += dr.select(chosen.is_edge, farther, 0) * lift(scene, p)
+            farther = self.outlines.edges.farther(scene, at.positions, chosen.edge, p)
+            in_world += dr.select(chosen.is_edge, farther, 0)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = 8 * ulp * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film

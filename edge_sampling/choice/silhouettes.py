@@ -12,7 +12,6 @@ from rimlight.edge_sampling.geometry.curves import PIECES, Curves
 from rimlight.edge_sampling.geometry.device_edges import beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
-from rimlight.edge_sampling.rays import lift
 
 from .edge_tree import EdgeTree
 from .sampling import EdgeSample, sample_edge
@@ -199,8 +198,8 @@ class Silhouettes:
         if self.tree is None or not self.tree.device_edges.any_farther:
             return aside
         active = sample.edge < self.count
-        farther = self.tree.device_edges.farther(placement.positions, dr.select(active, sample.edge, 0))
-        return aside + dr.select(active, farther, 0) * lift(scene, p)
+        farther = self.tree.device_edges.farther(scene, placement.positions, dr.select(active, sample.edge, 0), p)
+        return aside + dr.select(active, farther, 0)
 
     def point(
         self, placement: Placement, sample: EdgeSample, eye: mi.Point3f, far: mi.Bool | bool = False

@@ -6,19 +6,27 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.rays import lift, lift_beyond
+
 from .edges import EdgeKind, Edges
-from .meshes import Geometry, lets_light_through
+from .meshes import Geometry, bends_light, lets_rays_through
 
 #: Faces whose normals differ by less (sine of the angle) count as coplanar; vertex normals, as equal.
 COPLANAR = 1e-5
 
-#: How far beside the edges of meshes that light goes through to look, in units of the offset of rays that start there,
-#: times the cotangent of the angle between the faces: closer, rays through the mesh start beyond the other face.
+#: How far beside the edges of glass to look, in units of the offset of rays that start there, times the cotangent of
+#: the angle between the faces: closer, rays through the mesh start beyond the other face.
 BEHIND = 8
+
+#: And beside those of meshes that rays go through as if nothing was there, in units of the offset of such rays.
+BESIDE_MASK = 2
 
 #: And beside lines in which meshes cut through each other: closer, rays start below the other surface where that
 #: overhangs.
 BESIDE_LINE = 2
+
+#: Which meshes glass and masks are.
+KINDS = bends_light, lets_rays_through
 
 
 class DeviceEdges:
@@ -28,7 +36,7 @@ class DeviceEdges:
     """
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
-    _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_is_line", "_farther")
+    _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_is_line", "_glass", "_mask")
     DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "any_smooth", "any_farther", "_any_split", *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
@@ -43,11 +51,10 @@ class DeviceEdges:
         self.any_smooth = not self._kinds.isdisjoint({EdgeKind.SMOOTH, EdgeKind.SPLIT})
         self._two_faces = mi.Bool(edges.count == 2)
         self._is_line = mi.Bool(np.array(edges.is_line))
-        transmit = np.array([lets_light_through(m) for m in geometry.meshes])
-        farther = np.where(edges.is_line, BESIDE_LINE, BEHIND * transmit[edges.mesh].any(1))
-        self._farther = mi.Float(np.float32(farther))
+        glass, mask = (np.array([is_so(m) for m in geometry.meshes])[edges.mesh].any(1) for is_so in KINDS)
+        self._glass, self._mask = mi.Bool(glass & ~edges.is_line), mi.Bool(mask & ~edges.is_line)
         #: Is there an edge beside which `farther` is not 0?
-        self.any_farther = bool(farther.any())
+        self.any_farther = bool((glass | mask | edges.is_line).any())
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
@@ -132,17 +139,18 @@ class DeviceEdges:
         sine = dr.norm(dr.cross(first, second))
         return dr.select(dr.gather(mi.Bool, self._two_faces, edge) & (sine > COPLANAR), dr.square(sine), 0)
 
-    def farther(self, positions: mi.Float, edge: mi.UInt32) -> mi.Float:
-        """How much farther beside edges to look than rounding asks for, in units of the offset of rays. Detached.
+    def farther(self, scene: mi.Scene, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f) -> mi.Float:
+        """How much farther beside a point p of edges to look than rounding asks for: scene units. Detached.
 
         Rays start that far below the first face of glass, and so above the second, if they are closer to the edge than
         this times the cotangent of the angle between both.
         """
+        of = lambda kind: dr.gather(mi.Bool, kind, edge)
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         cotangent = dr.dot(first, second) / dr.norm(dr.cross(first, second))
-        wedge = dr.select(dr.gather(mi.Bool, self._two_faces, edge), dr.clip(cotangent, 0, 1), 0)
-        wedge = dr.select(dr.gather(mi.Bool, self._is_line, edge), 1, wedge)
-        return dr.detach(dr.gather(mi.Float, self._farther, edge) * wedge)
+        wedge = dr.select(of(self._glass) & of(self._two_faces), dr.clip(cotangent, 0, 1), 0)
+        farther = dr.select(of(self._is_line), BESIDE_LINE, BEHIND * wedge) * lift(scene, p)
+        return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
 
     def is_smooth(self, edge: mi.UInt32) -> mi.Bool:
         """Are interpolated normals, and all else, the same on both sides?"""

@@ -163,9 +163,15 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     return not mesh.has_vertex_texcoords() and any(has_place(o) for o in objects)
 
 
-def lets_light_through(shape: Any) -> bool:
-    """Does light go through a surface, refracted, scattered, or as it is?"""
-    return shape.bsdf() is not None and bool(shape.bsdf().flags() & mi.BSDFFlags.Transmission)
+def bends_light(shape: Any) -> bool:
+    """Does light go through a surface, refracted or scattered?"""
+    return shape.bsdf() is not None and bool(shape.bsdf().flags() & mi.BSDFFlags.Transmission & ~mi.BSDFFlags.Null)
+
+
+def lets_rays_through(shape: Any) -> bool:
+    """Can rays go through a surface as if nothing was there? (Mitsuba's `hair` says so, but they never do.)"""
+    bsdf = shape.bsdf()
+    return bsdf is not None and bool(bsdf.flags() & mi.BSDFFlags.Null) and bsdf.class_name() != "Hair"
 
 
 def has_normal_map(shape: Any) -> bool:

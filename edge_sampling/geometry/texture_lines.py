@@ -1,6 +1,8 @@
-"""Lines at which textures jump: checkerboards, bitmaps with the `nearest` filter, the slopes of bump maps.
+"""Lines at which textures jump: checkerboards, bitmaps with the `nearest` filter, the slopes of bump maps; and those
+along which mapped normals turn away from the viewer.
 
-They are the lines of a lattice: a texture jumps where a component of A·(u, v, 1) is whole, with a matrix A of its own.
+Each of them is where a function of a point on the surface is whole. Textures jump at the lines of a lattice: where a
+component of A·(u, v, 1) is whole, with a matrix A of its own.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .mapped_horizons import mapped_horizons
 from .meshes import Geometry, has_place, objects_below, texture_coordinates
 
 
@@ -23,63 +26,64 @@ class Lattice:
     shape: Any
     matrix: np.ndarray
 
-    def at(self, uv: mi.Point2f) -> mi.Point2f:
+    def at(self, si: mi.SurfaceInteraction3f) -> mi.Vector2f:
         """Place in the lattice; attached, if the texture coordinates are."""
         (a, b, c), (d, e, f) = self.matrix.tolist()
-        return mi.Point2f(a * uv.x + b * uv.y + c, d * uv.x + e * uv.y + f)
-
-    def along(self, duv: mi.Vector2f) -> mi.Vector2f:
-        """Derivative of that."""
-        (a, b, _), (d, e, _) = self.matrix.tolist()
-        return mi.Vector2f(a * duv.x + b * duv.y, d * duv.x + e * duv.y)
+        return mi.Vector2f(a * si.uv.x + b * si.uv.y + c, d * si.uv.x + e * si.uv.y + f)
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line. lattice : mi.UInt32, number of the lattice; second : mi.Bool, is it one of the second component?"""
+    """One line.
 
-    lattice: mi.UInt32
+    kind : mi.UInt32, number of the function that is whole there. second : mi.Bool, is its second component?
+    """
+
+    kind: mi.UInt32
     second: mi.Bool
 
 
 class TextureLines:
-    """The lattices of the textures of shapes.
+    """The lines on shapes.
 
     shapes : those that count.
     """
 
     DRJIT_STRUCT = dict.fromkeys(())  # for `dr.freeze`
 
-    def __init__(self, shapes: list[Any]):
-        self.lattices = [Lattice(s, m) for s in shapes for m in _matrices(s)]
+    def __init__(self, shapes: Sequence[Any]):
+        # Lattices last, since the last line counts where several are found: the slopes of bump maps jump there, and so
+        # may whether they turn away.
+        self.kinds = [horizon for s in shapes for horizon in mapped_horizons(s)]
+        self.kinds += [Lattice(s, m) for s in shapes for m in _matrices(s)]
 
     def __len__(self) -> int:
-        return len(self.lattices)
+        return len(self.kinds)
 
-    def cell(self, shape: mi.ShapePtr, uv: mi.Point2f) -> mi.UInt32:
+    def cell(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         """A number for the part of a surface between the lines."""
         found = mi.UInt32(0)
-        for lattice in self.lattices:
-            at = mi.Point2i(dr.floor(lattice.at(uv)))
+        for kind in self.kinds:
+            at = mi.Point2i(dr.floor(kind.at(si)))
             cell = mi.sample_tea_32(found ^ mi.UInt32(at.x), mi.UInt32(at.y))[0]
-            found = dr.select(shape == mi.ShapePtr(lattice.shape), cell, found)
+            found = dr.select(si.shape == mi.ShapePtr(kind.shape), cell, found)
         return found
 
-    def between(self, shape: mi.ShapePtr, a: mi.Point2f, b: mi.Point2f) -> Line:
-        """The line between two places on a surface that are next to each other."""
+    def between(self, a: mi.SurfaceInteraction3f, b: mi.SurfaceInteraction3f) -> Line:
+        """The line between two points of a surface that are next to each other."""
         which, second = mi.UInt32(0), mi.Bool(False)
-        for i, lattice in enumerate(self.lattices):
-            p, q = dr.floor(lattice.at(a)), dr.floor(lattice.at(b))
-            mine = (shape == mi.ShapePtr(lattice.shape)) & ((p.x != q.x) | (p.y != q.y))
+        for i, kind in enumerate(self.kinds):
+            p, q = dr.floor(kind.at(a)), dr.floor(kind.at(b))
+            mine = (a.shape == mi.ShapePtr(kind.shape)) & ((p.x != q.x) | (p.y != q.y))
             which, second = dr.select(mine, mi.UInt32(i), which), dr.select(mine, p.x == q.x, second)
         return Line(which, second)
 
-    def across(self, line: Line, vector: mi.Vector2f) -> mi.Float:
-        """Component across a line, in units of the lattice, of a derivative of texture coordinates."""
+    def across(self, line: Line, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """The function that is whole at a line; attached, if `si` is."""
         found = mi.Float(0)
-        for i, lattice in enumerate(self.lattices):
-            along = lattice.along(vector)
-            found = dr.select(line.lattice == i, dr.select(line.second, along.y, along.x), found)
+        for i, kind in enumerate(self.kinds):
+            at = kind.at(si)
+            found = dr.select(line.kind == i, dr.select(line.second, at.y, at.x), found)
         return found
 
 

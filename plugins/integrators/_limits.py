@@ -21,7 +21,7 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.cut_curves import cut_curves
-from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth, vertices
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, vertices
 from rimlight.edge_sampling.rays import extent
 from rimlight.transport.paths import Depths
 
@@ -41,20 +41,22 @@ class Moving:
     """What moves.
 
     known : the shapes that can: meshes, then analytic shapes. flags : do they? camera, lights : do these?
+    mapped : shapes whose normal maps or bump maps change.
     """
 
     known: tuple[Any, ...]
     flags: tuple[bool, ...]
     camera: bool
     lights: bool
+    mapped: tuple[Any, ...]
 
     @property
-    def key(self) -> tuple[tuple[bool, ...], bool, bool]:
-        return self.flags, self.camera, self.lights
+    def key(self) -> tuple:
+        return self.flags, self.camera, self.lights, tuple(id(s) for s in self.mapped)
 
     @property
     def anything(self) -> bool:
-        return self.camera or self.lights or any(self.flags)
+        return self.camera or self.lights or any(self.flags) or bool(self.mapped)
 
     @property
     def shapes(self) -> tuple[Any, ...]:
@@ -65,6 +67,11 @@ class Moving:
     def on_film(self) -> tuple[Any, ...]:
         """Those that move as seen from the camera."""
         return self.known if self.camera else self.shapes
+
+    @property
+    def with_lines(self) -> tuple[Any, ...]:
+        """Those on which lines move as seen from the camera: of textures, and where mapped normals turn away."""
+        return (*self.on_film, *(s for s in self.mapped if s not in self.on_film))
 
 
 def lasting_limits(
@@ -86,7 +93,7 @@ def lasting_limits(
         if depths.scatters(1):
             limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
-    return (*limits, *appearance(scene, moving, bisects=from_points), *outlines(scene, geometry, edges, moving))
+    return (*limits, *appearance(scene, depths, moving, bisects=from_points), *outlines(scene, geometry, edges, moving))
 
 
 def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool) -> list[str]:
@@ -109,7 +116,7 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
         limits.append(
             f'the derivative lacks the motion of {lacks}; give them a roughness, or set "sppi" to 0 to accept this.'
         )
-    through = names(s for s in scene.shapes() if lets_through(s))
+    through = names(s for s in scene.shapes() if lets_rays_through(s))
     if through and depths.scatters(2):
         limits.append(
             "the derivative lacks part of the motion of what is seen, and of what shines, through "
@@ -125,7 +132,7 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
     return limits
 
 
-def appearance(scene: mi.Scene, moving: Moving, *, bisects: bool) -> list[str]:
+def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool) -> list[str]:
     """What lacks of the jumps inside of surfaces and environments. bisects : are the lines of textures found?"""
     limits = []
     textures = jumping_textures(scene, besides=scene.shapes() if bisects else ())
@@ -134,11 +141,16 @@ def appearance(scene: mi.Scene, moving: Moving, *, bisects: bool) -> list[str]:
             f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
             "normal maps for bump maps."
         )
-    curved = names(s for s in moving.on_film if has_normal_map(s) and (not s.is_mesh() or is_smooth(s)))
-    if curved:
+    mapped = names(s for s in moving.with_lines if has_normal_map(s))
+    if mapped and not bisects:
         limits.append(
-            f"the derivative is off by some per cent at the outlines of {', '.join(curved)}: the normals of a normal "
+            f"the derivative is off by some per cent at the outlines of {', '.join(mapped)}: the normals of a normal "
             "map turn away from the sensor along lines inside of faces, whose jumps are not sampled."
+        )
+    elif mapped and depths.scatters(2):
+        limits.append(
+            f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
+            f"{', '.join(mapped)} turn away from what they light."
         )
     if (moving.camera or moving.lights) and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
         limits.append(
@@ -178,12 +190,6 @@ def outlines(scene: mi.Scene, geometry: Geometry, edges: Edges, moving: Moving) 
             f"{pairs}. Divide the longer edges there."
         )
     return limits
-
-
-def lets_through(shape: mi.Shape) -> bool:
-    """Can rays go through the shape as if nothing was there? (Mitsuba's `hair` says so, but they never do.)"""
-    bsdf = shape.bsdf()
-    return bsdf is not None and bool(bsdf.flags() & mi.BSDFFlags.Null) and bsdf.class_name() != "Hair"
 
 
 def is_mirror(shape: mi.Shape) -> bool:

@@ -27,6 +27,7 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.choice.light_choice import LightChoice
+from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.transport.paths import Depths
 
@@ -59,6 +60,7 @@ class BoundarySearch:
         self._checked = False
         self._partial: PartialParameters | None = None
         self._media: Media | None = None
+        self._maps: list[MappedHorizon] = []
         self._beyond: dict[tuple, tuple[mi.Sensor, list[str]]] = {}
         self._boundaries: dict[tuple, Boundaries] = {}
 
@@ -109,13 +111,14 @@ class BoundarySearch:
         self._refuse_while_recording()
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
         self.geometry = self.edges = self._lines = self._sources = self._partial = self._media = None
-        self._boundaries, self._beyond = {}, {}
+        self._boundaries, self._beyond, self._maps = {}, {}, []
         collect_before()
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
         self._sources = Sources(scene, params, geometry, self.edges, weld)
         self._partial, self._media = PartialParameters(scene), Media(scene)
+        self._maps = [m for s in scene.shapes() for m in mapped_horizons(s)]
 
     def _find_lines(self, scene: mi.Scene) -> None:
         """Find the lines in which the meshes cut through each other now."""
@@ -152,7 +155,8 @@ class BoundarySearch:
         lamps = any(s.is_emitter() and m for s, m in zip(shapes, moves, strict=True))
         others = [mi.traverse(e) for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
         lights = lamps or any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
-        return Moving(shapes, moves, camera, lights)
+        mapped = tuple(m.shape for m in self._maps if m.turns)
+        return Moving(shapes, moves, camera, lights, mapped)
 
     # ---------------------- Boundaries ----------------------
 
@@ -173,7 +177,7 @@ class BoundarySearch:
         what = moving.flags, moving.camera, moving.lights
         mirrors = [s for s in scene.shapes() if is_mirror(s)] if self.from_points and self.depths.scatters(1) else []
         mirrors = bool(mirrors), FineMirrors(mirrors) if mirrors else None
-        textures = TextureLines(scene.shapes() if mirrors[0] else moving.on_film) if self.from_points else ()
+        textures = TextureLines(scene.shapes() if mirrors[0] else moving.with_lines) if self.from_points else ()
         textures = textures if len(textures) else None
         lights = LightChoice.of(scene)
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *mirrors, textures, lights)

@@ -19,7 +19,7 @@ from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
 from rimlight.transport.cut_rays import CutRays
-from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment, uv_derivative
+from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment, change_of
 from rimlight.transport.replay import Chain, MovingVertex, written
 
 from .sampling import in_a_row, seed_of
@@ -151,8 +151,8 @@ class BisectionTerm(Term):
                 g = dr.select(at.grazes, dr.select(usable & at.grazes, dr.dot(moving.n, ray.d), 0), g)
             if line is not None:
                 on_line = usable & at.on_texture
-                uv = at.a.pi.compute_surface_interaction(ray, mi.RayFlags.All, on_line).uv
-                g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, mi.Vector2f(uv)), 0), g)
+                si = at.a.pi.compute_surface_interaction(ray, mi.RayFlags.All, on_line)
+                g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, si), 0), g)
         return dr.select(usable, -segment.weight * along / total, 0), g
 
 
@@ -168,13 +168,12 @@ def _at_outline(scene: mi.Scene, at: Parting, segment: Segment) -> tuple[Touch, 
 
 
 def _at_line(textures: TextureLines, at: Parting) -> tuple[Line, mi.Float, mi.Float]:
-    """The line of a texture that the rays meet, and the derivatives of g along and across the segment."""
+    """The line on a surface that the rays meet, and the derivatives of g along and across the segment."""
     active = at.found & at.on_texture
-    here = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, active)
-    there = at.b.pi.compute_surface_interaction(at.b.ray, mi.RayFlags.All, active)
-    line = textures.between(at.a.pi.shape, here.uv, there.uv)
-    moved = (uv_derivative(here, way.at(at.a.ray, here)) for way in (at.along, at.across))
-    return line, *(textures.across(line, duv) for duv in moved)
+    here, there = (v.pi.compute_surface_interaction(v.ray, mi.RayFlags.All, active) for v in (at.a, at.b))
+    line = textures.between(here, there)
+    g = partial(textures.across, line)
+    return line, *(change_of(g, at.a.ray, at.a.pi, way, active) for way in (at.along, at.across))
 
 
 def find_segment(chains: Chains, film: mi.Film, sampler: mi.Sampler) -> Segment:

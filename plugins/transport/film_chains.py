@@ -7,6 +7,7 @@ segment is bisected (`terms/mirrors.py`). Here chains are followed, and two of t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -18,6 +19,7 @@ from rimlight.edge_sampling.rays import spawn_ray
 from .log import Log
 from .paths import Vertex
 from .scattering import Next, Numbers
+from .surfaces import Surfaces, components
 from .tracer import PathTracer, camera_vertex
 
 #: Two points close to each other on the film show one surface, if they are at most so many times as far apart as the
@@ -59,15 +61,29 @@ class RayDerivative:
 
 def normal_derivative(si: mi.SurfaceInteraction3f, moved: mi.Vector3f) -> mi.Vector3f:
     """By how much the shading normal changes, where the point moves by so much."""
-    duv = uv_derivative(si, moved)
-    return duv.x * si.dn_du + duv.y * si.dn_dv
+    du, dv = components(moved, si.dp_du, si.dp_dv)
+    return du * si.dn_du + dv * si.dn_dv
 
 
-def uv_derivative(si: mi.SurfaceInteraction3f, moved: mi.Vector3f) -> mi.Vector2f:
-    """By how much the texture coordinates change, where the point moves by so much."""
-    uu, vv, uv = dr.squared_norm(si.dp_du), dr.squared_norm(si.dp_dv), dr.dot(si.dp_du, si.dp_dv)
-    a, b, det = dr.dot(moved, si.dp_du), dr.dot(moved, si.dp_dv), uu * vv - uv * uv
-    return mi.Vector2f(vv * a - uv * b, uu * b - uv * a) * dr.select(det > 0, dr.rcp(det), 0)
+def change_of(
+    function: Callable[[mi.SurfaceInteraction3f], mi.Float],
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    way: RayDerivative,
+    active: mi.Bool,
+) -> mi.Float:
+    """Derivative of a function of the point that a ray meets, where the ray moves, but not the scene. Detached."""
+    τ = dr.zeros(mi.Float, dr.width(ray))
+    with dr.resume_grad():
+        dr.enable_grad(τ)
+    with dr.resume_grad(τ):
+        moved = mi.Ray3f(ray)
+        moved.o, moved.d = ray.o + τ * way.o, ray.d + τ * way.d
+        value = function(pi.compute_surface_interaction(moved, mi.RayFlags.All, active))
+        dr.set_grad(τ, 1)
+        dr.enqueue(dr.ADMode.Forward, τ)
+        dr.traverse(dr.ADMode.Forward)
+        return dr.detach(dr.grad(value))
 
 
 class FilmRays:
@@ -223,6 +239,7 @@ class Chains:
 
     def __init__(self, tracer: PathTracer, rays: FilmRays, mirrors: bool, textures: TextureLines | None):
         self.tracer, self.rays, self.mirrors, self.textures = tracer, rays, mirrors, textures
+        self.surfaces = Surfaces(tracer.scene)
         bsdfs = [s.bsdf().flags() for s in tracer.scene.shapes() if s.bsdf() is not None]
         self._any_mask = mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
 
@@ -239,7 +256,7 @@ class Chains:
         """
         scene, ray, pi = self.tracer.scene, vertex.ray, vertex.pi
         met = active & pi.is_valid()
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, met)
+        si = self.surfaces.met(ray, pi, met)
         if self.tracer.fine_mirrors is not None:
             self.tracer.fine_mirrors.turn(si, ray, met)
         numbers = Numbers(mi.Point2f(0), mi.sample_tea_float32(choice, vertex.depth), mi.Point2f(0.5))
@@ -256,7 +273,7 @@ class Chains:
             weight = dr.select(mask, 2 * bsdf.eval_null_transmission(si, mask), weight)
         mirrored, through = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
         goes_on &= mirrored & (mask | dr.any(weight != 0))
-        next_ray = spawn_ray(scene, si, si.to_world(bs.wo))
+        next_ray = spawn_ray(scene, si, si.to_world(bs.wo), through)
         next_pi = scene.ray_intersect_preliminary(next_ray, active=goes_on)
         onwards = Next(next_ray, next_pi, weight, bs.eta, goes_on & through, mirrored, mirrored)
         reflected = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)
@@ -270,7 +287,7 @@ class Chains:
         shape = dr.reinterpret_array(mi.UInt32, pi.shape) ^ (dr.reinterpret_array(mi.UInt32, pi.instance) << 16)
         seen = Seen(
             dr.select(met, shape, 0),
-            dr.select(met, self.textures.cell(pi.shape, si.uv), 0) if self.textures is not None else mi.UInt32(0),
+            dr.select(met, self.textures.cell(si), 0) if self.textures is not None else mi.UInt32(0),
             dr.select(met, mi.Vector3f(si.p), ray.d),
             dr.select(met, mi.Vector3f(si.sh_frame.n), 0),
             dr.norm(dr.select(met, at, ways[0].d)),

@@ -344,9 +344,9 @@ def next_vertex(
         there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & lune.active) / pdf
         weight = dr.select(lune.active, there, weight)
     active = active & dr.any(weight != 0)
-    ray = spawn_ray(scene, si, si.to_world(bs.wo))
-    pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met
     through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
+    ray = spawn_ray(scene, si, si.to_world(bs.wo), through)
+    pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met
     slides = mirrored if vicinity is None else mirrored | vicinity.is_infinite(bsdf)
     return bs, Next(ray, pi, weight, bs.eta, active & through, mirrored, slides)
 

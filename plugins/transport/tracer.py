@@ -125,7 +125,7 @@ class PathTracer:
         if self.hide_emitters:
             skip = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array of pointers)
             at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
-            onwards = spawn_ray(self.scene, at, ray.d)
+            onwards = spawn_ray(self.scene, at, ray.d, True)
             pi[skip] = self._skip_area_emitters(self.scene, onwards, True, skip)
         return pi
 
