@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
-from random_scenes import ball
+from random_scenes import ball, tetrahedron
 
 
 def cube(centre=(0.1, 0.7, 0.1), size: float = 0.4, **props: Any) -> mi.Mesh:
@@ -45,6 +45,14 @@ def pane() -> mi.Scene:
     floor = horizontal((0, -0.2, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
     at = camera((1.2, 1.3, -3.4), (0.1, 0.5, 0))
     return scene(sensor=at, cube=cube(), pane=plate, floor=floor, sky=constant(0.5))
+
+
+def glass_tetrahedron() -> mi.Scene:
+    """A tetrahedron of glass under a sky, whose faces meet at less than a right angle."""
+    vertices, _, _, faces = tetrahedron()
+    vertices = 0.7 * vertices @ np.array(mi.ScalarTransform4f().rotate([0.3, 1, 0.2], 20).matrix)[:3, :3].T
+    shape = mesh("tetrahedron", vertices + [0, 0.4, 0], faces, bsdf={"type": "dielectric"})
+    return scene(sensor=camera((0.4, 1.4, -3.2), (0, 0.4, 0), fov=35), tetrahedron=shape, sky=constant(0.5))
 
 
 def bar(centre=(0.1, 0.4, 0.8)) -> mi.Mesh:
@@ -192,6 +200,7 @@ def bumpy_ball() -> mi.Scene:
 SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0.4]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
 MIRROR = {"key": "mirror.vertex_positions", "rotate": [0.6, 0.2, 1]}
+TETRAHEDRON = {"key": "tetrahedron.vertex_positions", "direction": [1, 0.3, 0.4]}
 CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.4]}
 BALL = {"key": "ball.to_world", "direction": [1, 0.3, 0.4]}
 MESH = {"key": "ball.vertex_positions", "direction": [1, 0.3, 0.4]}
@@ -207,6 +216,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "two_mirrors": (two_mirrors, TURN, 3e-3, 4),
     "mirrored_cut": (mirrored_cut, SLIDE, 3e-3, 3),
     "pane": (pane, SLIDE, 2e-3, 5),
+    "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),
     "glass_ball_camera": (glass_ball, CAMERA, 1e-3, 6),
     "mirrored_ball": (mirrored_ball, BALL, 2e-3, 3),
