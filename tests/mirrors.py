@@ -50,8 +50,8 @@ def pane() -> mi.Scene:
 def glass_tetrahedron() -> mi.Scene:
     """A tetrahedron of glass under a sky, whose faces meet at less than a right angle."""
     vertices, _, _, faces = tetrahedron()
-    vertices = 0.7 * vertices @ np.array(mi.ScalarTransform4f().rotate([0.3, 1, 0.2], 20).matrix)[:3, :3].T
-    shape = mesh("tetrahedron", vertices + [0, 0.4, 0], faces, bsdf={"type": "dielectric"})
+    turned = 0.7 * vertices @ np.array(mi.ScalarTransform4f().rotate([0.3, 1, 0.2], 20).matrix)[:3, :3].T
+    shape = mesh("tetrahedron", turned + np.array([0, 0.4, 0]), faces, bsdf={"type": "dielectric"})
     return scene(sensor=camera((0.4, 1.4, -3.2), (0, 0.4, 0), fov=35), tetrahedron=shape, sky=constant(0.5))
 
 

@@ -382,8 +382,8 @@ class Chains:
     def _starts_beyond(self, a: Vertex, b: Vertex) -> mi.Bool:
         """Do two rays part because one of them starts beyond the face that the other one meets?
 
-        Rays start a little below the face of glass that refracts them. So close to its edges, they start outside, and show
-        what is behind. `DeviceEdges.farther` looks past that at edges that the camera sees, which have the whole jump.
+        Rays start a little below the face of glass that refracts them. So close to its edges, they start outside, and
+        show what is behind. The film boundary looks past that (`DeviceEdges.farther`), and has the whole jump.
         """
         return dr.minimum(a.pi.t, b.pi.t) < AT_START * lift(self.tracer.scene, a.ray.o)
 
