@@ -36,8 +36,8 @@ STEP = 2e-3
 #: Samples per pixel of one image of the finite differences, and of one derivative.
 REFERENCE_SPP, SPP = 1024, 256
 
-#: Images that such an image is the mean of: sums of too many equal samples are off in single precision, and alike in all
-#: runs (by a tenth of what a sun that turns does to a floor).
+#: Images that such an image is the mean of: in single precision, sums of too many equal samples are off, and by the
+#: same in all runs.
 PASSES = 4
 
 #: How many of each are made: at first, and when that does not suffice to tell right from wrong.
@@ -700,7 +700,9 @@ def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, specia
                 for θ in (step, -step):
                     still.move(mi.Float(θ))
                     seeds = range(PASSES * len(reference), PASSES * (len(reference) + 1))
-                    passes = (mi.render(still.scene, integrator=path, spp=REFERENCE_SPP // PASSES, seed=s) for s in seeds)
+                    passes = (
+                        mi.render(still.scene, integrator=path, spp=REFERENCE_SPP // PASSES, seed=s) for s in seeds
+                    )
                     images.append(sum(np.array(image, np.float64) for image in passes) / PASSES)
                 reference.append((images[0] - images[1]) / (2 * step))
             while len(derivative) < derivatives:
