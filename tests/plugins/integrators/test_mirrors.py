@@ -22,11 +22,14 @@ INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb
         (mirrors.over_mirror, "mirror.vertex_positions"),
         (mirrors.two_mirrors, "sensor.to_world"),
         (mirrors.glass_ball, "ball.to_world"),
+        (mirrors.mapped_ball, "ball.vertex_positions"),
+        (mirrors.mapped_ball, "ball.bsdf.normalmap.data"),
+        (mirrors.bumpy_ball, "ball.to_world"),
     ],
 )
 def test_gradients_are_those_of_forward_mode(name, make, key):
     scene, made = make(), mi.load_dict(INTEGRATORS[name])
-    motion = Motion(scene, key, direction=[1, 0.4, 0.2])
+    motion = Motion(scene, key, direction=[1] if key.endswith("data") else [1, 0.4, 0.2])
     forward = np.array(derivative_image(scene, made, motion, spp=16, seed=3), float)
     weight = np.random.default_rng(0).uniform(0.5, 1, forward.shape)
     θ = mi.Float(0)
@@ -42,6 +45,11 @@ def test_gradients_are_those_of_forward_mode(name, make, key):
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_frozen_functions(name):
     assert_frozen_is_unfrozen(mirrors.over_mirror(), mi.load_dict(INTEGRATORS[name]), "cube.vertex_positions")
+
+
+@pytest.mark.parametrize("key", ["ball.vertex_positions", "ball.bsdf.normalmap.data"])
+def test_frozen_functions_with_normal_maps(key):
+    assert_frozen_is_unfrozen(mirrors.mapped_ball(), mi.load_dict(INTEGRATORS["direct_edge"]), key)
 
 
 @pytest.mark.parametrize(("textured", "flipped"), [(True, False), (False, True), (True, True)])
