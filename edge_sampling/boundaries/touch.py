@@ -30,11 +30,13 @@ class Touch:
 
     n : mi.Vector3f, across ray and outline. t : mi.Float, distance along the ray. Detached.
     moved : mi.Float, n · q, attached to the shapes.
+    cut : mi.Bool, is it a line in which a mesh cuts another surface?
     """
 
     n: mi.Vector3f
     t: mi.Float
     moved: mi.Float
+    cut: mi.Bool
 
 
 def touch_outline(
@@ -56,7 +58,8 @@ def touch_outline(
         return on_mesh
     on_curved = _of_curved(scene, ray, near, reach, active & ~is_mesh)
     with dr.resume_grad():
-        return Touch(*(dr.select(is_mesh, getattr(on_mesh, k), getattr(on_curved, k)) for k in ("n", "t", "moved")))
+        both = (dr.select(is_mesh, getattr(on_mesh, k), getattr(on_curved, k)) for k in ("n", "t", "moved"))
+        return Touch(*both, on_mesh.cut)
 
 
 def _of_mesh(ray, near, far, active) -> Touch:
@@ -91,7 +94,7 @@ def _of_mesh(ray, near, far, active) -> Touch:
     cut = active & far[1].is_valid() & (least > INSIDE * dr.squared_norm(n))
     of_cut = _of_cut(ray, near, far, cut)
     with dr.resume_grad():
-        return Touch(*(dr.select(cut, a, b) for a, b in zip(of_cut, (across, t, moved), strict=True)))
+        return Touch(*(dr.select(cut, a, b) for a, b in zip(of_cut, (across, t, moved), strict=True)), cut)
 
 
 def _of_cut(ray, near, far, active) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
@@ -123,7 +126,7 @@ def _of_curved(scene, ray, near, reach, active) -> Touch:
             tangent = dr.select(rim, at.dp_du, tangent)
     across = _unit(dr.cross(tangent, ray.d))
     with dr.resume_grad():
-        return Touch(across, dr.dot(at.p - ray.o, ray.d), dr.dot(across, si.p))
+        return Touch(across, dr.dot(at.p - ray.o, ray.d), dr.dot(across, si.p), mi.Bool(False))
 
 
 def _unit(v: mi.Vector3f) -> mi.Vector3f:

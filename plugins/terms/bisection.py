@@ -7,6 +7,7 @@ segment is bisected. How the jump moves follows from a function that vanishes th
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import drjit as dr
@@ -15,11 +16,14 @@ import mitsuba as mi
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart
 from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
+from rimlight.edge_sampling.geometry.device_edges import BEHIND, BESIDE_LINE
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
+from rimlight.edge_sampling.rays import lift
 from rimlight.transport.cut_rays import CutRays
 from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment, change_of
+from rimlight.transport.paths import Vertex
 from rimlight.transport.replay import Chain, MovingVertex, written
 
 from .sampling import in_a_row, seed_of
@@ -73,8 +77,9 @@ class BisectionTerm(Term):
             ray, weight = rays.at(segment.start)
             ray, again = cut(ray), cut(rays.at(segment.start)[0])
         at, moving = self._where_they_part(job, chains, segment, ray, active)
-        jump, alpha = self._jump(job, at, sampler)
-        factor, g = self._motion(job, at, segment, again, moving)
+        outline = _at_outline(job.tracer.scene, at, segment) if job.boundaries.mirrors else None
+        jump, alpha = self._jump(job, _beside(chains, at, segment, outline), sampler)
+        factor, g = self._motion(job, at, segment, again, moving, outline)
         dr.eval(jump, alpha, factor)
         with dr.resume_grad():
             normal_velocity = factor * (g - dr.detach(g)) * (job.weights * part.area / count)
@@ -111,7 +116,12 @@ class BisectionTerm(Term):
 
     @staticmethod
     def _motion(
-        job: Job, at: Parting, segment: Segment, camera_ray: mi.Ray3f, moving: MovingVertex | None
+        job: Job,
+        at: Parting,
+        segment: Segment,
+        camera_ray: mi.Ray3f,
+        moving: MovingVertex | None,
+        outline: tuple[Touch, mi.Float, mi.Float] | None,
     ) -> tuple[mi.Float, mi.Float]:
         """The factor by which the gradient of a function g makes the part of the velocity of a jump that segments of
         this axis count, times the weight of the segment; and g, attached to the scene.
@@ -119,15 +129,11 @@ class BisectionTerm(Term):
         g depends on film position and scene, and vanishes at the jump. With its gradient ∇g over the film, the jump
         moves by -∇g·(∂g/∂θ) / |∇g|². Segments along both axes find it, and count what is along them.
         """
-        scene, textures = job.tracer.scene, job.boundaries.textures
-        along, across, touch, line = mi.Float(0), mi.Float(0), None, None
-        if job.boundaries.mirrors:
-            touch, along, across = _at_outline(scene, at, segment)
-            if moving is not None:
-                of_plane = (dr.dot(dr.detach(moving.n), way.d) for way in (at.along, at.across))
-                along, across = (
-                    dr.select(at.grazes, new, old) for new, old in zip(of_plane, (along, across), strict=True)
-                )
+        textures, line = job.boundaries.textures, None
+        touch, along, across = outline if outline is not None else (None, mi.Float(0), mi.Float(0))
+        if outline is not None and moving is not None:
+            of_plane = (dr.dot(dr.detach(moving.n), way.d) for way in (at.along, at.across))
+            along, across = (dr.select(at.grazes, new, old) for new, old in zip(of_plane, (along, across), strict=True))
         if textures is not None:
             line, *of_line = _at_line(textures, at)
             along, across = (
@@ -165,6 +171,34 @@ def _at_outline(scene: mi.Scene, at: Parting, segment: Segment) -> tuple[Touch, 
     reach = segment.length * dr.norm(at.along.o + near[1].t * at.along.d)
     touch = touch_outline(scene, at.a.ray, near, far, reach, active)
     return touch, *(-dr.dot(touch.n, way.o + touch.t * way.d) for way in (at.along, at.across))
+
+
+def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch, mi.Float, mi.Float] | None) -> Parting:
+    """What is seen on both sides of an outline, a little farther aside than it is known.
+
+    Close to the edges of mirrors and glass, and to lines in which surfaces cut each other, rays start beyond the other
+    surface. This looks past that, unless other faces are there.
+    """
+    if outline is None:
+        return at
+    touch, along, _ = outline
+    edge = at.found & ~at.on_texture & ~at.grazes
+    lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, dr.select(touch.cut, BESIDE_LINE, 0))
+    aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
+    edge &= (lifts > 0) & (aside < LONGEST)
+    aside = dr.select(edge, aside, 0)
+    wide = replace(segment, start=segment.start - aside * segment.axis, length=segment.length + 2 * aside)
+    other = chains.part((chains.first(wide.start, edge), chains.first(wide.end, edge)), wide, edge, None)
+    same = lambda v, w: (v.pi.shape == w.pi.shape) & (v.pi.prim_index == w.pi.prim_index) & (v.depth == w.depth)
+    usable = edge & other.found & same(at.a, other.a) & same(at.b, other.b)
+    a, b = (dr.select(usable, new, old) for new, old in ((other.a, at.a), (other.b, at.b)))
+    return replace(at, a=a, b=b)
+
+
+def _goes_on(vertex: Vertex) -> mi.Bool:
+    """Does a mirror or glass reflect or refract the ray there?"""
+    flags = vertex.pi.shape.bsdf().flags()
+    return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
 
 
 def _at_line(textures: TextureLines, at: Parting) -> tuple[Line, mi.Float, mi.Float]:

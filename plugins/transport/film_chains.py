@@ -347,7 +347,7 @@ class Chains:
         rays, axis, choice = self.rays, segment.axis, segment.choice
         aside = mi.Vector2f(axis.y, axis.x)
 
-        def step(a, b, of_a, of_b, shown, shown_before, on_texture, grazes, found, active):
+        def step(a, b, of_a, of_b, shown, on_texture, grazes, found, active):
             here, there = self.link(a, of_a, choice, active), self.link(b, of_b, choice, active)
             same_shape = here.seen.way == there.seen.way
             # Is one of both on the wrong side of its face? If that is another face, they part at the edge.
@@ -355,8 +355,7 @@ class Chains:
             parts = ~same_shape | here.seen.is_apart_from(there.seen, segment.length) | (turns & ~same_face)
             on_line = active & ~parts & ~grazes & (here.seen.cells != there.seen.cells)
             on_texture |= on_line
-            counts = shown & (shown_before | ~self._starts_beyond(a, b))
-            found |= (active & (parts | grazes) & counts) | on_line
+            found |= (active & (parts | grazes) & shown & ~self._starts_beyond(a, b)) | on_line
             goes_on = active & ~parts & ~grazes & ~on_line & (here.lobe > 0) & ((here.lobe == there.lobe) | turns)
             grazes |= goes_on & turns
             if log is not None:
@@ -365,16 +364,15 @@ class Chains:
             a, b = (dr.select(goes_on, after(v, link), v) for v, link in ((a, here), (b, there)))
             of_a = tuple(dr.select(goes_on, new, old) for new, old in zip(here.ways, of_a, strict=True))
             of_b = tuple(dr.select(goes_on, new, old) for new, old in zip(there.ways, of_b, strict=True))
-            shown_now = shown | (goes_on & (here.lobe >= 2))
-            return a, b, of_a, of_b, shown_now, mi.Bool(shown), on_texture, grazes, found, goes_on
+            return a, b, of_a, of_b, shown | (goes_on & (here.lobe >= 2)), on_texture, grazes, found, goes_on
 
         if log is not None:
             log.arrive(first[0].depth, first[0], active)
         no = dr.full(mi.Bool, False, dr.width(active))
         of_a = rays.derivative(segment.start, axis), rays.derivative(segment.start, aside)
         of_b = (rays.derivative(segment.end, axis),)
-        state = (*first, of_a, of_b, no, *(mi.Bool(no) for _ in range(4)), mi.Bool(active))
-        a, b, of_a, _, _, _, on_texture, grazes, found, _ = dr.while_loop(
+        state = (*first, of_a, of_b, no, mi.Bool(no), mi.Bool(no), mi.Bool(no), mi.Bool(active))
+        a, b, of_a, _, _, on_texture, grazes, found, _ = dr.while_loop(
             state, lambda *state: state[-1], step, label="chains of mirrors"
         )
         return Parting(a, b, *of_a, on_texture, grazes, found)
@@ -382,8 +380,9 @@ class Chains:
     def _starts_beyond(self, a: Vertex, b: Vertex) -> mi.Bool:
         """Do two rays part because one of them starts beyond the face that the other one meets?
 
-        Rays start a little below the face of glass that refracts them. So close to its edges, they start outside, and
-        show what is behind. The film boundary looks past that (`DeviceEdges.farther`), and has the whole jump.
+        Rays start a little off the face that reflects or refracts them. So close to its edges, they may start beyond
+        the next face, and show what is behind. The border of such a strip does not count: what looks at the edge looks
+        past the strip, the film boundary (`DeviceEdges.farther`) as well as bisection, and has the whole jump.
         """
         return dr.minimum(a.pi.t, b.pi.t) < AT_START * lift(self.tracer.scene, a.ray.o)
 
