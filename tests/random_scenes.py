@@ -36,9 +36,10 @@ STEP = 2e-3
 #: Samples per pixel of one image of the finite differences, and of one derivative.
 REFERENCE_SPP, SPP = 1024, 256
 
-#: Images that such an image is the mean of: in single precision, sums of too many equal samples are off, and by the
-#: same in all runs.
+#: Images that such an image is the mean of: Mitsuba adds up samples in single precision, and sums of many equal ones
+#: are off by the same in all runs. About so much, relative to the image.
 PASSES = 4
+ROUNDING = REFERENCE_SPP / PASSES * 2**-24 / 8
 
 #: How many of each are made: at first, and when that does not suffice to tell right from wrong.
 STAGES = ((10, 6), (24, 24), (80, 96))
@@ -632,9 +633,15 @@ class Comparison:
         return f"{self.seed:6d} {verdict} {self.stage} " + (self.raised if self.raised else numbers) + " " + self.label
 
 
-def statistics(reference: np.ndarray, derivative: np.ndarray, row: Comparison) -> None:
-    """Fill in a row from runs of both: (R, H, W, C)."""
+def statistics(
+    reference: np.ndarray, derivative: np.ndarray, row: Comparison, rounding: np.ndarray | float = 0.0
+) -> None:
+    """Fill in a row from runs of both: (R, H, W, C).
+
+    rounding : (H, W, C), an error of the reference that is the same in all runs.
+    """
     ref, g = reference.mean(0), derivative.mean(0)
+    rounding = np.broadcast_to(rounding, ref.shape)
     ref_error = reference.std(0, ddof=1) / math.sqrt(len(reference))
     g_error = derivative.std(0, ddof=1) / math.sqrt(len(derivative))
     row.finite, row.size = bool(np.isfinite(derivative).all()), float(np.abs(ref).sum())
@@ -645,7 +652,7 @@ def statistics(reference: np.ndarray, derivative: np.ndarray, row: Comparison) -
     for mine, others in ((reference[::2], reference[1::2]), (reference[1::2], reference[::2])):
         mean, error = mine.mean(0), mine.std(0, ddof=1) / math.sqrt(len(mine))
         weight = np.where(np.abs(mean) > 3 * error, mean, 0)
-        products.append([(runs * weight).sum((1, 2, 3)) for runs in (derivative, others)])
+        products.append([*((runs * weight).sum((1, 2, 3)) for runs in (derivative, others)), weight])
     ours, theirs = (sum(float(p[k].mean()) for p in products) for k in (0, 1))
     if theirs <= 0:  # too little is seen to change
         row.size, row.relative = 0.0, float(np.abs(g).sum() > 4 * np.abs(g_error).sum())
@@ -653,12 +660,14 @@ def statistics(reference: np.ndarray, derivative: np.ndarray, row: Comparison) -
     row.scale = ours / theirs
     variance = (products[0][0] + products[1][0]).var(ddof=1) / len(derivative)
     variance += row.scale**2 * sum(p[1].var(ddof=1) / len(p[1]) for p in products)
-    row.error = math.sqrt(float(variance)) / theirs
+    shared = sum(float((np.abs(p[2]) * rounding).sum()) for p in products)
+    row.error = math.sqrt(float(variance) + shared**2) / theirs
     row.relative = float(np.abs(g - ref).sum()) / row.size
-    row.noise = math.sqrt(2 / math.pi) * float(np.hypot(g_error, ref_error).sum()) / row.size
+    row.noise = math.sqrt(2 / math.pi) * float(np.sqrt(g_error**2 + ref_error**2 + rounding**2).sum()) / row.size
     squares, totals = _squares(reference), _squares(np.abs(ref)[None])[0]
     difference = _squares(derivative)
     error = np.sqrt(squares.var(0, ddof=1) / len(squares) + difference.var(0, ddof=1) / len(difference))
+    error = np.hypot(error, _squares(rounding[None])[0])
     beyond = np.abs(difference.mean(0) - squares.mean(0)) - TOLERANCE * totals
     row.largest = float((beyond / (error + 1e-4 * totals.max())).max())
 
@@ -713,7 +722,8 @@ def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, specia
                 seed = 1000 + len(derivative)
                 image = integrator.render_forward(moving.scene, moving.params, seed=seed, spp=SPP)
                 derivative.append(np.array(image, np.float64))
-            statistics(np.array(reference), np.array(derivative), row)
+            rounding = ROUNDING * np.abs(images[0]) / (math.sqrt(2) * step)
+            statistics(np.array(reference), np.array(derivative), row, rounding)
             if not row.finite or (row.agrees and (row.stage or not row.error > TELLING)):
                 break
     except Exception as error:

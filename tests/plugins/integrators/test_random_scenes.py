@@ -58,6 +58,14 @@ def test_comparison_notices_a_factor(factor):
     assert not row.agrees
 
 
+def test_comparison_knows_of_errors_that_all_runs_share():
+    truth = np.random.default_rng(0).normal(size=(20, 20, 3)) * (np.arange(20) < 5)[:, None]
+    for off, agrees in ((0.05, True), (0.3, False)):
+        row = Comparison(0, "")
+        statistics(runs(truth, 0.01, 10, 1) + off, runs(truth, 0.01, 6, 2), row, rounding=np.float64(0.05))
+        assert row.agrees == agrees
+
+
 def test_comparison_notices_what_is_missing():
     """A term that is absent where the reference is small does not show in the projection."""
     truth = np.random.default_rng(0).normal(size=(20, 20, 3)) * np.where(np.arange(20) < 10, 1.0, 0.1)[:, None]
