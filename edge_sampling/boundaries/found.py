@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.choice.silhouettes import Silhouettes
+from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_lines import TextureLines
 
 from .face_planes import FacePlanes
@@ -21,8 +22,9 @@ class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
     does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see
     `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` :
-    those whose fringe is not looked at closely. `textures` : where those jump that the camera may see move. `lights` :
-    chooses one, where there are many."""
+    those whose fringe is not looked at closely. `textures` : where those jump that the camera may see move, and mapped
+    normals turn away. `surfaces` : what chains meet, where there are mirrors or textures. `lights` : chooses one, where
+    there are many."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -37,6 +39,7 @@ class Boundaries:
     mirrors: bool = False
     fine_mirrors: FineMirrors | None = None
     textures: TextureLines | None = None
+    surfaces: Surfaces | None = None
     lights: LightChoice | None = None
 
     @property

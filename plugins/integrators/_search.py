@@ -28,6 +28,7 @@ from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
+from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.transport.paths import Depths
 
@@ -179,8 +180,9 @@ class BoundarySearch:
         mirrors = bool(mirrors), FineMirrors(mirrors) if mirrors else None
         textures = TextureLines(scene.shapes() if mirrors[0] else moving.with_lines) if self.from_points else ()
         textures = textures if len(textures) else None
+        chains = (*mirrors, textures, Surfaces(scene) if mirrors[0] or textures else None)
         lights = LightChoice.of(scene)
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *mirrors, textures, lights)
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights)
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int

@@ -43,7 +43,7 @@ HIDDEN, HALVINGS = 0.25, 7
 WHAT = ("perfect mirrors or glass", "textures that jump")
 
 #: Most rays that one sample traces besides those of a path: for plans.
-RAYS = 2 * (3 * CANDIDATES + 9)
+RAYS = 2 * (3 * CANDIDATES + 11)
 
 
 class BisectionTerm(Term):
@@ -69,7 +69,7 @@ class BisectionTerm(Term):
         count = job.counts.on_line(film)
         sampler = in_a_row(job.sensor, seed_of(self.name, job.seed, i), count)
         rays = FilmRays(part.sensor, sampler)
-        chains = Chains(job.tracer, rays, job.boundaries.mirrors, job.boundaries.textures)
+        chains = Chains(job.tracer, rays, job.boundaries)
         segment = bisect(chains, find_segment(chains, film, sampler), sampler)
         active = (segment.weight > 0) & inside_frame(segment.middle, film)
         cut = CutRays(job.mode)

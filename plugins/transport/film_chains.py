@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.geometry.texture_lines import TextureLines
+from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.geometry.surfaces import components
 from rimlight.edge_sampling.rays import lift, spawn_ray
 
 from .log import Log
 from .paths import Vertex
 from .scattering import Next, Numbers
-from .surfaces import Surfaces, components
 from .tracer import PathTracer, camera_vertex
 
 #: Two points close to each other on the film show one surface, if they are at most so many times as far apart as the
@@ -237,14 +237,14 @@ class Parting:
 class Chains:
     """Follows chains of mirrors from the camera.
 
-    mirrors : are there any? textures : whose lines count; None: none.
+    boundaries : with what is known of mirrors, of textures whose lines count, and of surfaces.
     """
 
-    def __init__(self, tracer: PathTracer, rays: FilmRays, mirrors: bool, textures: TextureLines | None):
-        self.tracer, self.rays, self.mirrors, self.textures = tracer, rays, mirrors, textures
-        self.surfaces = Surfaces(tracer.scene)
+    def __init__(self, tracer: PathTracer, rays: FilmRays, boundaries: Boundaries):
+        self.tracer, self.rays, self.surfaces = tracer, rays, boundaries.surfaces
+        self.mirrors, self.textures = boundaries.mirrors, boundaries.textures
         bsdfs = [s.bsdf().flags() for s in tracer.scene.shapes() if s.bsdf() is not None]
-        self._any_mask = mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
+        self._any_mask = self.mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
 
     def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:
         """What the camera sees at u."""

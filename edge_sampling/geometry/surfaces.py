@@ -5,8 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling import objects_below
-from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals
+from .meshes import has_interpolated_normals, objects_below
 
 
 class Surfaces:
@@ -15,6 +14,8 @@ class Surfaces:
     Mitsuba 3.9 differentiates the normals of all shapes with respect to the texture coordinates, but interpolated
     normals of meshes with respect to barycentric coordinates, and before `flip_normals` turns them round.
     """
+
+    DRJIT_STRUCT = dict.fromkeys(())  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene):
         meshes = [o for o in objects_below(scene).values() if isinstance(o, mi.Mesh) and has_interpolated_normals(o)]
