@@ -7,7 +7,7 @@ component of A·(u, v, 1) is whole, with a matrix A of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,10 +52,11 @@ class TextureLines:
     DRJIT_STRUCT = dict.fromkeys(())  # for `dr.freeze`
 
     def __init__(self, shapes: Sequence[Any]):
-        # Lattices last, since the last line counts where several are found: the slopes of bump maps jump there, and so
-        # may whether they turn away.
-        self.kinds = [horizon for s in shapes for horizon in mapped_horizons(s)]
-        self.kinds += [Lattice(s, m) for s in shapes for m in _matrices(s)]
+        # Of each shape, lattices last, since the last line counts where several are found: the slopes of bump maps jump
+        # there, and so may whether they turn away.
+        of_shapes = [(s, [*mapped_horizons(s), *(Lattice(s, m) for m in _matrices(s))]) for s in shapes]
+        self.kinds = [kind for _, kinds in of_shapes for kind in kinds]
+        self._shapes = [(s, kinds) for s, kinds in of_shapes if kinds]
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -63,28 +64,39 @@ class TextureLines:
     def cell(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         """A number for the part of a surface between the lines."""
         found = mi.UInt32(0)
-        for kind in self.kinds:
-            at = mi.Point2i(dr.floor(kind.at(si)))
+        for which, there in self._of(si):
+            at = mi.Point2i(dr.floor(self._at(which, si, there)))
             cell = mi.sample_tea_32(found ^ mi.UInt32(at.x), mi.UInt32(at.y))[0]
-            found = dr.select(si.shape == mi.ShapePtr(kind.shape), cell, found)
+            found = dr.select(there, cell, found)
         return found
 
     def between(self, a: mi.SurfaceInteraction3f, b: mi.SurfaceInteraction3f) -> Line:
         """The line between two points of a surface that are next to each other."""
-        which, second = mi.UInt32(0), mi.Bool(False)
-        for i, kind in enumerate(self.kinds):
-            p, q = dr.floor(kind.at(a)), dr.floor(kind.at(b))
-            mine = (a.shape == mi.ShapePtr(kind.shape)) & ((p.x != q.x) | (p.y != q.y))
-            which, second = dr.select(mine, mi.UInt32(i), which), dr.select(mine, p.x == q.x, second)
-        return Line(which, second)
+        line = Line(mi.UInt32(0), mi.Bool(False))
+        for which, there in self._of(a):
+            p, q = (dr.floor(self._at(which, si, there)) for si in (a, b))
+            mine = there & ((p.x != q.x) | (p.y != q.y))
+            line = Line(dr.select(mine, which, line.kind), dr.select(mine, p.x == q.x, line.second))
+        return line
 
     def across(self, line: Line, si: mi.SurfaceInteraction3f) -> mi.Float:
         """The function that is whole at a line; attached, if `si` is."""
-        found = mi.Float(0)
-        for i, kind in enumerate(self.kinds):
-            at = kind.at(si)
-            found = dr.select(line.kind == i, dr.select(line.second, at.y, at.x), found)
-        return found
+        at = self._at(line.kind, si, True)
+        return dr.select(line.second, at.y, at.x)
+
+    def _of(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.UInt32, mi.Bool]]:
+        """The functions of the shape of a point, one after the other: their numbers, and whether it has so many."""
+        for k in range(max(len(kinds) for _, kinds in self._shapes)):
+            which, there = mi.UInt32(0), mi.Bool(False)
+            for shape, kinds in self._shapes:
+                if k < len(kinds):
+                    mine = si.shape == mi.ShapePtr(shape)
+                    which, there = dr.select(mine, self.kinds.index(kinds[k]), which), there | mine
+            yield which, there
+
+    def _at(self, which: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool | bool) -> mi.Vector2f:
+        """The value of one function. As calls, since a scene may have many maps, each of them with a texture."""
+        return dr.switch(which, [lambda si, active, kind=kind: kind.at(si) for kind in self.kinds], si, mi.Bool(active))
 
 
 def _matrices(shape: Any) -> list[np.ndarray]:
