@@ -197,7 +197,7 @@ MUTANTS = [
     mutant(
         "film boundary: looks as near beside glass as beside other meshes",
         FILM,
-        "in_world += dr.select(chosen.is_edge, farther, 0) * lift(scene, p)",
+        "in_world += dr.select(chosen.is_edge, farther, 0)",
         "pass",
     ),
     mutant(

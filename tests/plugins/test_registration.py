@@ -217,9 +217,9 @@ def test_packages_are_imported_by_their_name(root: Path, folder: str) -> None:
 
 #: What each room may import: itself, and those before it.
 ROOMS = (
+    "rimlight.edge_sampling.rays",
     "rimlight.edge_sampling.geometry",
     "rimlight.edge_sampling.projection",
-    "rimlight.edge_sampling.rays",
     "rimlight.edge_sampling.lights",
     "rimlight.edge_sampling.smooth_lamps",
     "rimlight.edge_sampling.parametrisation",
