@@ -19,13 +19,13 @@ from .meshes import is_map, objects_below
 class MappedHorizon:
     """Where the normals of one map turn away.
 
-    texture : of the normals; or of the heights, which are multiplied by `scale`. scale : None for normals.
+    bsdf : the map. texture : of its normals, or heights.
     two_sided : do both sides of the surface have the same map?
     """
 
     shape: Any
+    bsdf: mi.BSDF
     texture: Any
-    scale: float | None
     two_sided: bool
 
     @property
@@ -38,7 +38,7 @@ class MappedHorizon:
         wi = mi.Vector3f(si.wi)
         if self.two_sided:
             wi.z = dr.abs(wi.z)
-        n = 2 * mi.Vector3f(self.texture.eval_3(si)) - 1 if self.scale is None else self._from_heights(si)
+        n = self._from_heights(si) if _has_heights(self.bsdf) else 2 * mi.Vector3f(self.texture.eval_3(si)) - 1
         facing = dr.dot(wi, n)
         # Between -1 and 1, so that it is whole at 0 only.
         return mi.Vector2f(facing / (1 + dr.abs(facing)), 0.5)
@@ -46,7 +46,7 @@ class MappedHorizon:
     def _from_heights(self, si: mi.SurfaceInteraction3f) -> mi.Vector3f:
         """As Mitsuba's `bumpmap` makes it: in the frame of shading."""
         n = mi.Vector3f(si.sh_frame.n)
-        slope = self.scale * mi.Vector2f(self.texture.eval_1_grad(si))
+        slope = mi.traverse(self.bsdf)["scale"] * mi.Vector2f(self.texture.eval_1_grad(si))
         along_u = si.dp_du + n * (slope.x - dr.dot(n, si.dp_du))
         along_v = si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv))
         bumped = dr.cross(along_u, along_v)
@@ -61,8 +61,10 @@ def mapped_horizons(shape: Any) -> list[MappedHorizon]:
     for name, o in below.items():
         if not (isinstance(o, mi.BSDF) and is_map(o)):
             continue
-        heights = o.class_name() == "BumpMap"
-        texture = objects_below(o)["nested_texture" if heights else "normalmap"]
-        scale = float(mi.traverse(o)["scale"]) if heights else None
-        found.append(MappedHorizon(shape, texture, scale, any(name.startswith(f"{b}.") for b in both)))
+        texture = objects_below(o)["nested_texture" if _has_heights(o) else "normalmap"]
+        found.append(MappedHorizon(shape, o, texture, any(name.startswith(f"{b}.") for b in both)))
     return found
+
+
+def _has_heights(bsdf: mi.BSDF) -> bool:
+    return bsdf.class_name() == "BumpMap"

@@ -56,7 +56,9 @@ class TextureLines:
         # there, and so may whether they turn away.
         of_shapes = [(s, [*mapped_horizons(s), *(Lattice(s, m) for m in _matrices(s))]) for s in shapes]
         self.kinds = [kind for _, kinds in of_shapes for kind in kinds]
-        self._shapes = [(s, kinds) for s, kinds in of_shapes if kinds]
+        numbers = iter(range(len(self.kinds)))
+        #: Shapes, and the numbers of their functions.
+        self._shapes = [(s, [next(numbers) for _ in kinds]) for s, kinds in of_shapes if kinds]
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -86,12 +88,12 @@ class TextureLines:
 
     def _of(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.UInt32, mi.Bool]]:
         """The functions of the shape of a point, one after the other: their numbers, and whether it has so many."""
-        for k in range(max(len(kinds) for _, kinds in self._shapes)):
+        for k in range(max(len(numbers) for _, numbers in self._shapes)):
             which, there = mi.UInt32(0), mi.Bool(False)
-            for shape, kinds in self._shapes:
-                if k < len(kinds):
+            for shape, numbers in self._shapes:
+                if k < len(numbers):
                     mine = si.shape == mi.ShapePtr(shape)
-                    which, there = dr.select(mine, self.kinds.index(kinds[k]), which), there | mine
+                    which, there = dr.select(mine, numbers[k], which), there | mine
             yield which, there
 
     def _at(self, which: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool | bool) -> mi.Vector2f:

@@ -156,7 +156,7 @@ class BoundarySearch:
         lamps = any(s.is_emitter() and m for s, m in zip(shapes, moves, strict=True))
         others = [mi.traverse(e) for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
         lights = lamps or any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
-        mapped = tuple(m.shape for m in self._maps if m.turns)
+        mapped = tuple(dict.fromkeys(m.shape for m in self._maps if m.turns))
         return Moving(shapes, moves, camera, lights, mapped)
 
     # ---------------------- Boundaries ----------------------

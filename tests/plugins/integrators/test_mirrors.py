@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from frozen import assert_frozen_is_unfrozen
 
-from rimlight.checks import Motion, derivative_image
+from rimlight.checks import Motion, compare, derivative_image, finite_differences
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
 
@@ -63,3 +63,13 @@ def test_texture_coordinates_and_flipped_normals_do_not_change_mirrors(textured,
     plain, other = derivatives
     # Without, they are 1.7 to 4 times as far apart as they are large; rounding makes up to 0.02.
     assert np.abs(other - plain).sum() < 0.05 * np.abs(plain).sum()
+
+
+def test_two_textures_of_one_shape():
+    """Lines of both count: finite differences of a checkerboard behind a mask of texels."""
+    checkers = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": mirrors.checkers()}}
+    scene = mirrors.board(type="mask", opacity=mirrors.texels(1, lowest=0.2), nested=checkers)
+    motion, integrator = Motion(scene, **mirrors.BOARD), mi.load_dict(INTEGRATORS["direct_edge"])
+    reference = finite_differences(scene, motion, step=2e-3, runs=8, spp=1024, max_depth=2)
+    derivatives = [np.array(derivative_image(scene, integrator, motion, spp=64, seed=k), float) for k in range(8)]
+    assert not compare(np.stack(derivatives), reference).faults()

@@ -7,6 +7,7 @@ import sys
 
 import cases
 import drjit as dr
+import mirrors
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -329,3 +330,13 @@ def test_derivatives_do_not_hold_the_scene(make):
         assert sys.getrefcount(scene) == before
     finally:
         gc.enable()
+
+
+def test_a_bump_map_that_becomes_steeper():
+    scene, used = mirrors.bumpy_ball(), direct_edge()
+    before = derivative(scene, used, "ball.to_world")
+    params = mi.traverse(scene)
+    params["ball.bsdf.scale"] = 3.0
+    params.update()
+    after = assert_as_fresh(scene, used, direct_edge, "ball.to_world")
+    assert np.abs(after - before).sum() > 0.1 * np.abs(before).sum()
