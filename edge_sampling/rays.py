@@ -11,9 +11,10 @@ rays start closer to surfaces. In all others, they start where Mitsuba's do.
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 #: Largest offset in small scenes, relative to their diagonal, in RayEpsilon.
 PART = 0.25
@@ -35,7 +36,7 @@ def spawn_ray(
         surface, and closer to it: Mitsuba's starts beside that line, and shows edges where they are not on the film.
     """
     ray = si.spawn_ray(d)
-    if _is_small(scene):
+    if _size_if_small(scene) is not None:
         ray.o = _start(scene, si, d)
     if through is not False:
         with dr.suspend_grad():
@@ -47,7 +48,7 @@ def spawn_ray(
 def spawn_ray_to(scene: mi.Scene, si: mi.SurfaceInteraction3f, p: mi.Point3f) -> mi.Ray3f:
     """The ray from `si` to just before the point p, as Mitsuba's `spawn_ray_to`."""
     ray = si.spawn_ray_to(p)
-    if _is_small(scene):
+    if _size_if_small(scene) is not None:
         ray.o = _start(scene, si, p - si.p)
         d = p - ray.o
         distance = dr.norm(d)
@@ -59,15 +60,15 @@ def lift(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
     """How far above a surface rays start at its point p: mi.Float, (N,), scene units."""
     reach = dr.max(dr.abs(p))
     usual = mi.Float(1 + reach)
-    if _is_small(scene):
-        usual = dr.maximum(dr.minimum(usual, PART * _size(scene)), LEAST * reach)
+    size = _size_if_small(scene)
+    if size is not None:
+        usual = dr.maximum(dr.minimum(usual, PART * size), LEAST * reach)
     return usual * mi.math.RayEpsilon
 
 
 def lift_beyond(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
     """`lift` of rays that go through the surface as if nothing was there."""
-    size, _ = extent(scene)
-    reach = dr.maximum(dr.max(dr.abs(p)), _size(scene)) if np.isfinite(size) else np.inf
+    reach = dr.maximum(dr.max(dr.abs(p)), _power_of_two(extent(scene)[0]))
     return dr.minimum(lift(scene, p), THROUGH * mi.math.RayEpsilon * reach)
 
 
@@ -80,16 +81,19 @@ def _start(scene, si, d) -> mi.Point3f:
 def extent(scene: mi.Scene) -> tuple[float, float]:
     """Diagonal of the box around a scene, and its largest coordinate: infinity and zero, if there is no such box."""
     box = scene.bbox()
-    lower, upper = np.array([box.min, box.max], np.float64).reshape(2, 3)
-    size, reach = np.linalg.norm(upper - lower), np.abs([lower, upper]).max()
-    return (float(size), float(reach)) if box.valid() and np.isfinite(reach) else (np.inf, 0.0)
+    lower, upper = list(box.min), list(box.max)
+    reach = max(map(abs, lower + upper))
+    return (math.dist(lower, upper), reach) if box.valid() and math.isfinite(reach) else (math.inf, 0.0)
 
 
-def _size(scene: mi.Scene) -> float:
-    """Diagonal of the scene, up to the next power of two, so that a scene that changes keeps its kernels."""
-    return float(2.0 ** np.ceil(np.log2(extent(scene)[0])))
+def _size_if_small(scene: mi.Scene) -> float | None:
+    """Diagonal of the scene, up to the next power of two, so that a scene that changes keeps its kernels; None: nowhere
+    is the usual offset too large."""
+    size, reach = extent(scene)
+    size = _power_of_two(size)
+    return size if 0 < size < 1 + reach else None
 
 
-def _is_small(scene: mi.Scene) -> bool:
-    """Is the usual offset too large somewhere?"""
-    return 0 < _size(scene) < 1 + extent(scene)[1]
+def _power_of_two(size: float) -> float:
+    """The next one, from `size` on."""
+    return 2.0 ** math.ceil(math.log2(size)) if 0 < size < math.inf else size

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight._collection import no_collection
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
@@ -142,6 +143,8 @@ class EdgeTree:
         # An array for each packet: several scatters to one array would be as many kernels.
         self.nodes = [dr.zeros(mi.Float, self.node_offsets[-1] * 4) for _ in range(NODE_PACKETS)]
         self.slots = [dr.zeros(mi.Float, self.leaf_offsets[-1] * LEAF * 4) for _ in range(SLOT_PACKETS)]
+        # Of the time that the refit of a small tree takes, 95 % are for tracing the same program again.
+        self._recorded = dr.freeze(EdgeTree._refit)
 
     @property
     def bytes(self) -> int:
@@ -163,6 +166,13 @@ class EdgeTree:
 
     def refit(self, positions: mi.Float) -> None:
         """Follow the vertices to `positions`, (3 V,), world space; detached."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            self._refit(positions)  # as a part of what is being recorded
+        else:
+            with no_collection():
+                self._recorded(self, positions)
+
+    def _refit(self, positions: mi.Float) -> None:
         with dr.suspend_grad():
             slot = dr.arange(mi.UInt32, dr.width(self.slot_edge))
             _scatter(self.slots, slot, self._slots_of(positions, slot).pack())

@@ -177,6 +177,24 @@ def test_refit_leaves_nothing_of_the_former_positions(groups):
     assert (before != fresh.numbers("nodes")).any()
 
 
+def test_refit_does_the_same_whether_it_is_recorded_replayed_or_traced():
+    setups = [tree_over(*still_life(), groups=odd_and_even) for _ in range(3)]
+    recorded, traced, frozen = (setup.tree for setup in setups)
+    # A function that users freeze has the refit as a part of its own recording.
+    in_users_function = dr.freeze(lambda tree, positions: tree.refit(positions))
+    p = mi.Float(setups[0].geometry.positions())
+    for k in range(4):
+        q = p * dr.opaque(mi.Float, 1 + 0.3 * k)
+        recorded.refit(q)
+        traced._refit(q)
+        # In turn, by its own recording and by theirs.
+        frozen.refit(q) if k % 2 else in_users_function(frozen, q)
+        for which in ("nodes", "slots"):
+            expected = setups[1].numbers(which)
+            assert all((setup.numbers(which) == expected).all() for setup in setups)
+    assert in_users_function.n_recordings == 1
+
+
 def test_refit_root_equals_that_of_a_tree_built_there():
     setup = tree_over(bumpy_sphere(200))
     positions = moved(setup)
