@@ -40,18 +40,18 @@ LEAST_SPACE = 64
 
 @dataclass(frozen=True)
 class _Walked:
-    """Edges along which rays are traced, on the device: their end points, the third vertices of their two faces; and
-    have they two? mesh : on the host, of which they are."""
+    """Edges along which rays are traced, on the device: their end points, the third vertices of their two faces; have
+    they two? And of which mesh they are."""
 
     ends: list[mi.UInt32]
     opposite: list[mi.UInt32]
     two: mi.Bool
-    mesh: np.ndarray
+    mesh: mi.UInt32
 
     @staticmethod
     def of(edges: Edges) -> _Walked:
-        ends = [_index(edges.vertices[:, 0, k]) for k in (0, 1)]
-        return _Walked(ends, [_index(edges.opposite[:, k]) for k in (0, 1)], mi.Bool(edges.count > 1), edges.mesh[:, 0])
+        ends, opposite = ([_index(v[:, k]) for k in (0, 1)] for v in (edges.vertices[:, 0], edges.opposite))
+        return _Walked(ends, opposite, mi.Bool(edges.count > 1), _index(edges.mesh[:, 0]))
 
 
 class Intersections:
@@ -96,20 +96,25 @@ class Intersections:
             return False
         self._at = arrays
         before = self.meshes, self.capacity
-        self.meshes = meshes = tuple(sorted(_overlapping(geometry) | self._by_themselves))
+        boxes = _overlapping(geometry)
+        boxes.update(dict.fromkeys(self._by_themselves, np.array([[-np.inf] * 3, [np.inf] * 3])))
+        self.meshes = meshes = tuple(sorted(boxes))
         if not meshes:
             self._keep([], 0)
             return bool(self.capacity) and before != (meshes, self.capacity)
         with dr.suspend_grad():
             walked, positions = self._edges_of(meshes), dr.detach(replace(geometry, lines=None).positions())
-            counts = self._walk(scene, positions, walked)
+            within = np.zeros((self._meshes, 2, 3), np.float32)
+            within[list(meshes)] = [boxes[i] for i in meshes]
+            within = mi.Float(within.ravel())
+            counts = self._walk(scene, positions, walked, within)
             ends = dr.cumsum(counts)
             count = int(ends[-1])
             if count > self.capacity:
                 self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
             found = [dr.zeros(mi.UInt32, max(count, 1)) for _ in range(CORNERS)]
             if count:
-                self._walk(scene, positions, walked, into=found, start=ends - counts)
+                self._walk(scene, positions, walked, within, into=found, start=ends - counts)
             self._keep(found, count)
         return bool(self.capacity) and before != (meshes, self.capacity)
 
@@ -134,13 +139,14 @@ class Intersections:
         with dr.suspend_grad():
             walked = _Walked.of(self._edges)
             counts = self._walk(scene, dr.detach(geometry.positions()), walked, themselves=True)
-        return set(walked.mesh[counts.numpy() > 0].tolist())
+        return set(walked.mesh.numpy()[counts.numpy() > 0].tolist())
 
     def _walk(
         self,
         scene: mi.Scene,
         positions: mi.Float,
         walked: _Walked,
+        within: mi.Float | None = None,
         *,
         into: list[mi.UInt32] | None = None,
         start: mi.UInt32 | None = None,
@@ -149,6 +155,7 @@ class Intersections:
         """Follow each edge through all the faces that it goes through; how many pairs it finds from their lower ends:
         (E,).
 
+        within : for each mesh, the lower and the upper corner of a box outside of which nothing cuts it, (6 M,).
         into, start : where to write the vertices of the pairs, from where on for each edge.
         themselves : only those within one mesh.
         """
@@ -156,10 +163,13 @@ class Intersections:
         a, b = (point(e) for e in walked.ends)
         own = [[a, b, point(o)] for o in walked.opposite]
         place = [dr.gather(mi.UInt32, self._place, e) for e in walked.ends]
-        mesh = _index(walked.mesh)
         length = dr.norm(b - a)
         d = (b - a) / length
         step = rounding(a, b)
+        active = (length > 0) & dr.isfinite(length)
+        if within is not None:
+            lower, upper = (dr.gather(mi.Point3f, within, 2 * walked.mesh + k) for k in (0, 1))
+            active &= dr.all((dr.maximum(a, b) >= lower - step) & (dr.minimum(a, b) <= upper + step))
 
         def through(t, count, k, active):
             ray = mi.Ray3f(mi.Point3f(a + t * d), d)
@@ -176,7 +186,7 @@ class Intersections:
                 at = dr.gather(mi.UInt32, self._place, v, is_mesh)
                 foreign &= (at != place[0]) & (at != place[1])
             if themselves:
-                foreign &= dr.gather(mi.UInt32, self._mesh_of_face, face, is_mesh) == mesh
+                foreign &= dr.gather(mi.UInt32, self._mesh_of_face, face, is_mesh) == walked.mesh
             other, met = [point(v) for v in vertices], ray(pi.t)
             for side, mine in enumerate(own):
                 lower, upper, cut = common_line(mine, other)
@@ -191,9 +201,9 @@ class Intersections:
             t += pi.t + step
             return t, count, k + 1, active & (t < length) & (k < MOST_FACES)
 
-        width = len(walked.mesh)
+        width = dr.width(walked.mesh)
         zero = dr.zeros(mi.UInt32, width)
-        state = (dr.zeros(mi.Float, width), mi.UInt32(zero), mi.UInt32(zero), (length > 0) & dr.isfinite(length))
+        state = (dr.zeros(mi.Float, width), mi.UInt32(zero), mi.UInt32(zero), active)
         return dr.while_loop(state, lambda *s: s[-1], through, label="edges through faces")[1]
 
     # ---------------------- As edges ----------------------
@@ -303,16 +313,17 @@ def _follow(p: mi.Point3f, first: list[mi.Point3f], second: list[mi.Point3f], ac
     return mi.Point3f(p + dr.select(active, n * α + m * β, 0))
 
 
-def _overlapping(geometry: Geometry) -> set[int]:
-    """Meshes whose boxes overlap that of another one."""
+def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
+    """Meshes whose boxes overlap that of another one: their numbers, and the box around all that they have in common
+    with others, (2, 3)."""
     boxes = [m.bbox() for m in geometry.meshes]
-    lower, upper = (np.array([np.ravel(getattr(b, k)) for b in boxes], np.float64) for k in ("min", "max"))
     if len(boxes) < 2:
-        return set()
-    apart = (lower[:, None] > upper[None]).any(2)
-    overlap = ~(apart | apart.T)
+        return {}
+    lower, upper = (np.array([np.ravel(getattr(b, k)) for b in boxes], np.float64) for k in ("min", "max"))
+    lower, upper = np.maximum(lower[:, None], lower[None]), np.minimum(upper[:, None], upper[None])
+    overlap = (lower <= upper).all(2)
     np.fill_diagonal(overlap, False)
-    return set(np.flatnonzero(overlap.any(1)).tolist())
+    return {i: np.array([lower[i, row].min(0), upper[i, row].max(0)]) for i, row in enumerate(overlap) if row.any()}
 
 
 def _first_faces(geometry: Geometry) -> mi.UInt32:

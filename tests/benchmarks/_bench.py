@@ -26,6 +26,7 @@ import rimlight  # first: it chooses the LLVM library
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
 
+import building  # noqa: E402
 import cases  # noqa: E402
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
@@ -156,11 +157,13 @@ def median_seconds(function: Callable[[int], Any], calls: int) -> float:
 
 def at_resolution(build: Callable[[], mi.Scene], res: int) -> mi.Scene:
     """A scene of the test cases with res × res pixels."""
-    before, cases.RES = cases.RES, res
+    before, building.RES = building.RES, res
     try:
-        return build()
+        scene = build()
     finally:
-        cases.RES = before
+        building.RES = before
+    assert tuple(scene.sensors()[0].film().size()) == (res, res), "the scene has a film of its own"
+    return scene
 
 
 def bumpy_ball(rings: int, name: str, normals: bool = False, **props: Any) -> mi.Mesh:
