@@ -173,7 +173,7 @@ def test_all_that_is_read_is_known_to_frozen_functions():
         (boundaries.shadows.lights, set()),
         (shading, {"geometry", "cut_lamps"}),
         (shading.silhouettes, {"geometry"}),
-        (shading.silhouettes.tree, {"geometry", "node_offsets", "leaf_offsets"}),
+        (shading.silhouettes.tree, {"geometry", "node_offsets", "leaf_offsets", "_recorded"}),
         (shading.silhouettes.curves, set()),
     ):
         assert vars(part).keys() - unread == type(part).DRJIT_STRUCT.keys(), type(part).__name__
