@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.cut import Cut
 
 from ._layers import Layers
 
@@ -89,7 +89,7 @@ class Forward:
         self.tangent = mi.Spectrum(0)
 
     def start(self, ray: mi.Ray3f) -> mi.Ray3f:
-        rays = CutRays(dr.ADMode.Backward)
+        rays = Cut(dr.ADMode.Backward)
         cut = rays(ray)
         rays.forward()
         return cut
@@ -144,7 +144,7 @@ class Backward:
         self.light: list[mi.Spectrum] = []  # of each vertex, times its throughput and its gradient
         self.weights: list[mi.Spectrum] = []  # of the step after each vertex; attached
         self.emitted = mi.Float(0)  # attached
-        self.start = self.rays = CutRays(dr.ADMode.Backward)
+        self.start = self.rays = Cut(dr.ADMode.Backward)
 
     def emission(self, light, value, place, active) -> None:
         δ = self.layers.at(self.layers.footprint(place.u, active), light, active) * place.β

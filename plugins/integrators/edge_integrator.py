@@ -139,8 +139,11 @@ class EdgeIntegrator(ADIntegrator):
                 dr.traverse(dr.ADMode.Backward)
                 # The interior by itself, and first: traversed together with the film boundary, or after it, Dr.Jit 1.5
                 # loses what it gives to one mesh where another one has interpolated normals.
-                pairs = list(zip(terms, values, strict=True))
-                for group in (pairs[:1], pairs[1:]):
+                # Those that are cut are not traversed with others: at what lies behind these, Dr.Jit evaluates all, but
+                # the gradients at the cuts, which would then trace all rays again.
+                (first, *others) = zip(terms, values, strict=True)
+                cut, whole = ([pair for pair in others if bool(pair[0].cuts) == is_cut] for is_cut in (True, False))
+                for group in ([first], cut, whole):
                     for term, value in group:
                         gradient = dr.grad(value)
                         if term.replay is not None:
@@ -151,9 +154,12 @@ class EdgeIntegrator(ADIntegrator):
                         dr.set_grad(term.value, gradient)
                         dr.enqueue(dr.ADMode.Backward, term.value)
                     dr.traverse(dr.ADMode.Backward)
+                    cuts = [cut for term, _ in group for cut in term.cuts]
+                    for cut in cuts:
+                        cut.schedule()
                     dr.eval()
-                for cut in (cut for term in terms for cut in term.cuts):
-                    cut.backward()
+                    for cut in cuts:
+                        cut.backward()
             dr.eval()
         report_gradients(self.name, params)
 

@@ -21,7 +21,7 @@ from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
 from rimlight.edge_sampling.rays import lift
-from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.cut import Cut
 from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment, change_of
 from rimlight.transport.paths import Vertex
 from rimlight.transport.replay import Chain, MovingVertex, written
@@ -71,8 +71,11 @@ class BisectionTerm(Term):
         rays = FilmRays(part.sensor, sampler)
         chains = Chains(job.tracer, rays, job.boundaries)
         segment = bisect(chains, find_segment(chains, film, sampler), sampler)
+        # What is found here is used again in the kernels of the gradients, which are not to look for it again.
+        sampler.schedule_state()
+        dr.eval(segment)
         active = (segment.weight > 0) & inside_frame(segment.middle, film)
-        cut = CutRays(job.mode)
+        cut = Cut(job.mode)
         with dr.resume_grad():
             ray, weight = rays.at(segment.start)
             ray, again = cut(ray), cut(rays.at(segment.start)[0])

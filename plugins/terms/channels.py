@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling import FilmPart
 from rimlight.transport.channels import LABELS
-from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.cut import Cut
 
 from .film import FilmTerm
 from .interior import InteriorTerm
@@ -39,7 +39,7 @@ class ChannelsTerm(InteriorTerm):
         if not job.counts.interior:
             return FilmSamples(position, ChannelSample([mi.Float(0)] * job.tracer.count), *shared)
         # Differences of neighbouring rays lose their digits where the gradients of these are summed one by one.
-        rays = CutRays(dr.ADMode.Forward if job.tracer.needs_differentials else job.mode)
+        rays = Cut(dr.ADMode.Forward if job.tracer.needs_differentials else job.mode)
         # A sensor that shows nothing there, as outside of a fisheye's circle, has a weight of zero.
         values = job.tracer.values(rays(job.tracer.sized(ray)), dr.any(weight != 0), attached=True)
         return FilmSamples(position, ChannelSample(values), *shared, cuts=(rays,))

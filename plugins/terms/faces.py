@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
+from rimlight.transport.cut import Cut
 from rimlight.transport.replay import ChosenVertex
 
 from .points import FromPoints
@@ -27,8 +28,8 @@ class FacePlanesTerm(FromPoints):
 
     def reflected(
         self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, ChosenVertex | None]:
+    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
         point, chosen = job.tracer.point(ray, sampler, job.mode)
         L = job.boundaries.planes.sample(job.tracer, point, sampler)
         with dr.resume_grad():
-            return L * point.β, chosen
+            return L * point.β, () if chosen is None else (chosen,)

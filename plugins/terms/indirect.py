@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
+from rimlight.transport.cut import Cut
 from rimlight.transport.replay import ChosenVertex
 
 from .points import FromPoints, placement_and_point
@@ -27,9 +28,9 @@ class IndirectShadowsTerm(FromPoints):
 
     def reflected(
         self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, ChosenVertex | None]:
+    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
         shadows = job.boundaries.indirect
-        placement, point, chosen = placement_and_point(job, shadows.silhouettes, ray, sampler, beyond=1)
+        placement, point, cuts = placement_and_point(job, shadows.silhouettes, ray, sampler, beyond=1)
         L = shadows.at(job.tracer, placement, point, sampler, choice)
         with dr.resume_grad():
-            return L * point.β, chosen
+            return L * point.β, cuts

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
-from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.cut import Cut
 
 from .sampling import over_film
 from .term import FilmSamples, Job, Sample, Term
@@ -32,7 +32,7 @@ class InteriorTerm(Term):
         ray, ray_weight, position = job.sample_rays(sampler)
         if not job.counts.interior:
             return FilmSamples(position, Sample(mi.Spectrum(0), mi.Float(0)), ray.wavelengths, 1.0, job.weights)
-        rays = CutRays(job.mode)
+        rays = Cut(job.mode)
         found = job.tracer.radiance(rays(ray), sampler, mi.Bool(True), attached=True)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(found.L * ray_weight), mi.Float(0))

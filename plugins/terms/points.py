@@ -12,7 +12,7 @@ from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import Silhouettes, stratified
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.silhouettes import Placement
-from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.cut import Cut
 from rimlight.transport.replay import ChosenVertex
 
 from .sampling import over_film, seed_of
@@ -31,12 +31,11 @@ class FromPoints(Term):
         sampler, spp = over_film(job.sensor, seed, job.counts.shading)
         ray, ray_weight, position = job.sample_rays(sampler)
         choice = stratified(sampler, seed)
-        rays = CutRays(job.mode)
-        L, chosen = self.reflected(job, rays(ray), sampler, choice)
+        rays = Cut(job.mode)
+        L, cuts = self.reflected(job, rays(ray), sampler, choice)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(L * ray_weight * (job.weights / spp)), mi.Float(0))
-        cuts = (rays,) if chosen is None else (chosen, rays)
-        return FilmSamples(position, value, ray.wavelengths, 0.0, spp, cuts=cuts)
+        return FilmSamples(position, value, ray.wavelengths, 0.0, spp, cuts=(*cuts, rays))
 
     @abstractmethod
     def boundary(self, job: Job) -> object | None:
@@ -45,9 +44,9 @@ class FromPoints(Term):
     @abstractmethod
     def reflected(
         self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, ChosenVertex | None]:
-        """What the boundary does to the light along camera rays: mi.Spectrum, (N,), zero, with its gradient; and what
-        hands on the gradients of points, see `PathTracer.point`.
+    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
+        """What the boundary does to the light along camera rays: mi.Spectrum, (N,), zero, with its gradient; and where
+        that is cut, see `FilmSamples`.
 
         choice : uniform in [0, 1), stratified.
         """
@@ -70,21 +69,26 @@ class PointsTerm(FromPoints):
 
     def reflected(
         self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, ChosenVertex | None]:
+    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
         silhouettes = job.boundaries.shading.silhouettes
-        placement, point, chosen = placement_and_point(job, silhouettes, ray, sampler)
+        placement, point, cuts = placement_and_point(job, silhouettes, ray, sampler)
         L = job.boundaries.shading.sample(job.tracer, placement, point, sampler, choice)
         with dr.resume_grad():
-            return L * point.β, chosen
+            return L * point.β, cuts
 
 
 def placement_and_point(
     job: Job, silhouettes: Silhouettes, ray: mi.Ray3f, sampler: mi.Sampler, beyond: int = 0
-) -> tuple[Placement, ShadingPoint, ChosenVertex | None]:
-    """Where the shapes are, and a point of each path, as `PathTracer.point` has it."""
+) -> tuple[Placement, ShadingPoint, tuple[ChosenVertex | Cut, ...]]:
+    """Where the shapes are, a point of each path, as `PathTracer.point` has it, and where both are cut."""
     find = lambda: job.tracer.point(ray, sampler, job.mode, beyond=beyond)
     # The motion of a chain is found at once, in forward mode: then nothing else may be attached to the shapes yet.
     found = find() if job.tracer.scatters(2) and job.mode == dr.ADMode.Forward else None
+    cut = Cut(job.mode)
     with dr.resume_grad():
         placement = silhouettes.placement()
-    return placement, *(found or find())
+        placement.positions = cut.array(placement.positions)
+        if placement.frames is not None:
+            placement.frames = cut.array(placement.frames)
+    point, chosen = found or find()
+    return placement, point, (cut,) if chosen is None else (chosen, cut)

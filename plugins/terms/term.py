@@ -14,7 +14,7 @@ import mitsuba as mi
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart, film_parts
 from rimlight.edge_sampling.boundaries.found import Boundaries
-from rimlight.transport.cut_rays import CutRays
+from rimlight.transport.cut import Cut
 from rimlight.transport.replay import ChosenVertex, Replay
 from rimlight.transport.tracer import PathTracer
 
@@ -55,7 +55,7 @@ class FilmSamples:
     per_pixel: int
     replay: Replay | None = None
     throughput: mi.Spectrum | None = None
-    cuts: tuple[ChosenVertex | CutRays, ...] = ()
+    cuts: tuple[ChosenVertex | Cut, ...] = ()
 
     def detached(self) -> FilmSamples:
         return replace(self, value=dr.detach(self.value))

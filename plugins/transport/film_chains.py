@@ -287,9 +287,8 @@ class Chains:
         beyond = tuple(
             dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
         )
-        shape = dr.reinterpret_array(mi.UInt32, pi.shape) ^ (dr.reinterpret_array(mi.UInt32, pi.instance) << 16)
         seen = Seen(
-            dr.select(met, shape, 0),
+            dr.select(met, _shape_of(pi), 0),
             dr.select(met, self.textures.cell(si), 0) if self.textures is not None else mi.UInt32(0),
             dr.select(met, mi.Vector3f(si.p), ray.d),
             dr.select(met, mi.Vector3f(si.sh_frame.n), 0),
@@ -317,6 +316,8 @@ class Chains:
 
         axis : of the film, along which that is to be compared.
         """
+        if not self.mirrors:
+            return self._cell(u, active)
 
         def step(vertex, derivative, seen, active):
             link = self.link(vertex, (derivative,), choice, active)
@@ -331,6 +332,15 @@ class Chains:
 
         state = (self.first(u, active), self.rays.derivative(u, axis), Seen.nothing(dr.width(u)), active)
         return dr.while_loop(state, lambda v, δ, s, active: active, step, label="chain of mirrors")[2]
+
+    def _cell(self, u: mi.Point2f, active: mi.Bool) -> Seen:
+        """What the camera sees at u, as far as the lines of textures ask for it: the shape, and the cell."""
+        vertex = self.first(u, active)
+        met = active & vertex.pi.is_valid()
+        seen = Seen.nothing(dr.width(u))
+        seen.way = dr.select(met, _shape_of(vertex.pi), 0)
+        seen.cells = dr.select(met, self.textures.cell(self.surfaces.met(vertex.ray, vertex.pi, met)), 0)
+        return seen
 
     def part(
         self,
@@ -385,6 +395,11 @@ class Chains:
         past the strip, the film boundary (`DeviceEdges.farther`) as well as bisection, and has the whole jump.
         """
         return dr.minimum(a.pi.t, b.pi.t) < AT_START * lift(self.tracer.scene, a.ray.o)
+
+
+def _shape_of(pi: mi.PreliminaryIntersection3f) -> mi.UInt32:
+    """A number for the shape that is met, or for one in an instance."""
+    return dr.reinterpret_array(mi.UInt32, pi.shape) ^ (dr.reinterpret_array(mi.UInt32, pi.instance) << 16)
 
 
 def after(vertex: Vertex, link: Link) -> Vertex:

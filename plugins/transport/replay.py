@@ -295,6 +295,10 @@ class MovingVertex:
         )
         return p, n, d
 
+    def schedule(self) -> None:
+        """Let the next evaluation find the gradients, in the kernel of what they come from."""
+        dr.schedule(dr.grad(self.p), dr.grad(self.n), dr.grad(self.d))
+
     def backward(self) -> None:
         """Hand the gradients on to the surfaces, and to the camera rays."""
         chain, log = self.chain, self.log
@@ -360,7 +364,9 @@ class ChosenVertex(MovingVertex):
                     log.arrive(vertex.depth + 1, onwards, active)
 
             random = sampler if log is not None else sampler.clone()
-            return choose_vertex(scene, random, first, depths, vicinity, first.pi.is_valid(), note)
+            chosen = choose_vertex(scene, random, first, depths, vicinity, first.pi.is_valid(), note)
+            random.schedule_state()
+            return chosen
 
         log, chosen = written(scene, first.ray, 1, depths, follow, lambda chosen: chosen[0].depth)
         vertex, active, since, self.density = chosen
@@ -392,6 +398,7 @@ def written(
         last = 2 + int(dr.max(last_of(follow(None)))[0])
     log = Log(scene, like, first, last)
     found = follow(log)
-    dr.eval(last_of(found))
+    # All at once: what is not evaluated now would follow the paths again when it is.
+    dr.eval(found)
     log.close()
     return log, found
