@@ -35,9 +35,9 @@ CANDIDATES = 8
 #: Length of the segments, pixels; and to which they are bisected, in units in the last place of the film's size.
 LONGEST, SHORTEST = 1.0, 16
 
-#: Part of the segments that are looked at for jumps of which both ends know nothing; and how often those are halved at
+#: One in so many candidates is looked at for jumps of which both ends know nothing; and how often those are halved at
 #: most before. All numbers are equally likely: near corners, the variance is the sum of their reciprocal probabilities.
-HIDDEN, HALVINGS = 0.25, 7
+HIDDEN, HALVINGS = 4, 7
 
 #: What is looked for, in plans.
 WHAT = ("perfect mirrors or glass", "textures that jump")
@@ -228,18 +228,19 @@ def find_segment(chains: Chains, film: mi.Film, sampler: mi.Sampler) -> Segment:
     def candidate(k, kept, total, sampler):
         at = sampler.next_2d()
         axis = dr.select(sampler.next_1d() < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
-        hidden, level = sampler.next_1d() < HIDDEN, sampler.next_1d()
+        hidden, level = k % HIDDEN == 0, sampler.next_1d()
         choice = mi.UInt32(sampler.next_1d() * 0x1000000)
         halvings = dr.floor(level * (HALVINGS + 1))
         length = dr.select(hidden, LONGEST * dr.exp2(-halvings), LONGEST)
-        density = length * dr.select(hidden, HIDDEN / (HALVINGS + 1), 1 - HIDDEN) / (2 * size.x * size.y)
+        density = length * dr.select(hidden, 1 / (HIDDEN * (HALVINGS + 1)), 1 - 1 / HIDDEN) / (2 * size.x * size.y)
         yes = mi.Bool(True)
         where = mi.Point2f(start + at * size)
         a = chains.end(where, axis, choice, yes)
         b = chains.end(where + length * axis, axis, choice, yes)
-        middle = chains.end(where + 0.5 * length * axis, axis, choice, yes)
-        whole = Segment(where, length, axis, a, b, choice, dr.rcp(density))
-        whole.weight = dr.select(a.differs(b, length) == hidden, 0, whole.weight)
+        # Few segments have different ends. So of most candidates, the middle is not looked at.
+        wanted = a.differs(b, length) != hidden
+        middle = chains.end(where + 0.5 * length * axis, axis, choice, wanted)
+        whole = Segment(where, length, axis, a, b, choice, dr.select(wanted, dr.rcp(density), 0))
         found = whole.half(middle, sampler)
         total += found.weight
         taken = sampler.next_1d() * total < found.weight
