@@ -191,6 +191,25 @@ def mapped_ball() -> mi.Scene:
     return in_the_light_of_a_point(mesh("ball", 0.7 * vertices + [0, 0.4, 0.3], faces, normals=True, uv=uv, bsdf=bsdf))
 
 
+def aligned_ball() -> mi.Scene:
+    """A smooth-shaded ball, whose texture jumps along edges of its mesh."""
+    vertices, _, uv, faces = ball(20)
+    bsdf = {"type": "diffuse", "reflectance": texels(3, size=(5, 8))}
+    turned = 0.7 * vertices @ np.array(mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 37).matrix)[:3, :3].T
+    shape = mesh("ball", turned + np.array([0, 0.4, 0.3]), faces, normals=True, uv=uv, bsdf=bsdf)
+    return scene(sensor=camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35), ball=shape, sky=constant(0.5), lamp=lamp())
+
+
+def mirrored_lamp() -> mi.Scene:
+    """A smooth-shaded ball that shines over a mirror. Close to its outline, its normals turn away, and it is dark."""
+    vertices, _, _, faces = ball(60)
+    shape = mesh(
+        "ball", 0.4 * vertices + [0, 0.6, 0.2], faces, normals=True, bsdf=diffuse(0.0), emitter=light(2, 1.5, 1)
+    )
+    floor = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "mirror", bsdf={"type": "conductor"})
+    return scene(sensor=camera((0.6, 1.9, -3.4), (0.1, 0.2, 0)), ball=shape, mirror=floor, sky=constant(0.2))
+
+
 def bumpy_ball() -> mi.Scene:
     bsdf = {**mapped("bumpmap"), "scale": 1.0}
     ball = {"type": "sphere", "id": "ball", "center": [0, 0.4, 0.3], "radius": 0.7, "bsdf": bsdf}
@@ -232,4 +251,6 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "mapped_ball_camera": (mapped_ball, CAMERA, 2e-3, 2),
     "mapped_ball_map": (mapped_ball, MAP, 2e-3, 2),
     "bumpy_ball": (bumpy_ball, BALL, 2e-3, 2),
+    "aligned_ball": (aligned_ball, MESH, 2e-3, 2),
+    "mirrored_lamp": (mirrored_lamp, CAMERA, 2e-3, 2),
 }

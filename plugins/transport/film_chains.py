@@ -124,6 +124,7 @@ class Seen:
     p, n : mi.Vector3f, the point and its shading normal; of rays that meet nothing, the direction, and 0.
     moved, turned : mi.Float, how much p and n change per pixel.
     cells : mi.UInt32, equal for chains that meet equal parts of textures.
+    uv, drifted : mi.Vector2f and mi.Float, texture coordinates there, and how much they change per pixel.
     shown : mi.Bool, by a mirror, or by glass that bends rays?
     """
 
@@ -131,8 +132,10 @@ class Seen:
     cells: mi.UInt32
     p: mi.Vector3f
     n: mi.Vector3f
+    uv: mi.Vector2f
     moved: mi.Float
     turned: mi.Float
+    drifted: mi.Float
     shown: mi.Bool
 
     @staticmethod
@@ -145,10 +148,15 @@ class Seen:
         return (shown & (elsewhere | self.is_apart_from(other, distance))) | (~elsewhere & (self.cells != other.cells))
 
     def is_apart_from(self, other: Seen, distance: mi.Float) -> mi.Bool:
-        """Is there a gap, or a crease, between two points that are seen so many pixels apart?"""
-        apart = APART * distance * dr.minimum(self.moved, other.moved)
+        """Is there a gap, a crease, or a seam of texture coordinates, between two points that are seen so many pixels
+        apart?"""
         scale = dr.maximum(dr.max(dr.abs(self.p)), dr.max(dr.abs(other.p)))
-        gap = dr.norm(self.p - other.p) > apart + ROUNDING * dr.epsilon(mi.Float) * scale
+        near = APART * distance * dr.minimum(self.moved, other.moved) + ROUNDING * dr.epsilon(mi.Float) * scale
+        gap = dr.norm(self.p - other.p) > near
+        # As far as that is in texture coordinates.
+        per_unit = dr.maximum(self.drifted / self.moved, other.drifted / other.moved)
+        rounding = ROUNDING * dr.epsilon(mi.Float) * dr.maximum(dr.norm(self.uv), dr.norm(other.uv))
+        gap |= dr.norm(self.uv - other.uv) > near * per_unit + rounding
         return gap | (dr.norm(self.n - other.n) > APART * distance * dr.minimum(self.turned, other.turned) + BENT)
 
 
@@ -287,13 +295,17 @@ class Chains:
         beyond = tuple(
             dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
         )
+        cells = dr.select(met, self.textures.cell(si), 0) if self.textures is not None else mi.UInt32(0)
+        textured = met & (cells != 0)  # if there are lines on the shape
         seen = Seen(
             dr.select(met, _shape_of(pi), 0),
-            dr.select(met, self.textures.cell(si), 0) if self.textures is not None else mi.UInt32(0),
+            cells,
             dr.select(met, mi.Vector3f(si.p), ray.d),
             dr.select(met, mi.Vector3f(si.sh_frame.n), 0),
+            dr.select(textured, mi.Vector2f(si.uv), 0),
             dr.norm(dr.select(met, at, ways[0].d)),
             dr.norm(dr.select(met, normal_derivative(si, at), 0)),
+            dr.select(textured, dr.norm(mi.Vector2f(*components(at, si.dp_du, si.dp_dv))), 0),
             mi.Bool(False),
         )
         return Link(seen, onwards, beyond, lobe, numbers)

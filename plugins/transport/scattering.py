@@ -101,8 +101,7 @@ class Scattering:
 
         vicinity : in which that slides; None: it is a material point.
         met : what the ray to it meets, if that is known.
-        lune : where it is active, directions are sampled from there in place of the BSDF. Of what comes from elsewhere,
-            only a part is found then. Only where no gradients are carried.
+        lune : where it is active, only what comes from there is found. Only where no gradients are carried.
         """
         chosen = self._choose(si, numbers, active)
         from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, lune, chosen) if self.any else 0
@@ -150,6 +149,8 @@ class Scattering:
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
             if lune is not None:
                 pdf = dr.select(lune.active, lune.pdf(direction), pdf)
+                # What comes from elsewhere is the same on both sides of an edge, unless a texture jumps there, too.
+                active &= ~lune.active | (pdf > 0)
             mis = power_heuristic(ds.pdf, pdf)
             if len(self.held.smooth_lamps) and to_lamp is not None:
                 mis = to_lamp.attach(mis, ds.pdf, pdf, by_light=True)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
-from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side
+from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.light_choice import LightChoice
@@ -177,6 +177,7 @@ class PathTracer:
         beside_outline : see `scattered`.
         """
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
+        turn_to_viewer(si, vertex.ray, active & beside_outline)
         shines = active & ((vertex.depth > 1) | (not self.hide_emitters))
         emitted = si.emitter(self.scene).eval(si, shines)
         one = dr.full(mi.Spectrum, 1, dr.width(active))
