@@ -206,6 +206,24 @@ MUTANTS = [
         "lift = spawn_ray(scene, si, towards).o - si.p",
         "lift = 0 * towards",
     ),
+    mutant(
+        "film boundary: soft light from elsewhere than a lune counts",
+        SCATTERING,
+        "active &= ~lune.active | (pdf > 0)",
+        "pass",
+    ),
+    mutant(
+        "mirrors and textures: seams of texture coordinates count twice",
+        "plugins/transport/film_chains.py",
+        "gap |= dr.norm(self.uv - other.uv) > near * per_unit + rounding",
+        "pass",
+    ),
+    mutant(
+        "mirrors and textures: lamps are dark just inside of their outline",
+        "plugins/transport/tracer.py",
+        "turn_to_viewer(si, vertex.ray, active & beside_outline)",
+        "pass",
+    ),
     # ---------------------- Chains ----------------------
     mutant(
         "shadows in indirect light: 2 % too large",

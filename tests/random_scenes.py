@@ -655,7 +655,7 @@ def statistics(
         products.append([*((runs * weight).sum((1, 2, 3)) for runs in (derivative, others)), weight])
     ours, theirs = (sum(float(p[k].mean()) for p in products) for k in (0, 1))
     if theirs <= 0:  # too little is seen to change
-        row.size, row.relative = 0.0, float(np.abs(g).sum() > 4 * np.abs(g_error).sum())
+        row.size, row.relative = 0.0, float(np.abs(g).sum() > 4 * (g_error + ref_error).sum())
         return
     row.scale = ours / theirs
     variance = (products[0][0] + products[1][0]).var(ddof=1) / len(derivative)
