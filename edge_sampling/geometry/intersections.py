@@ -316,10 +316,9 @@ def _follow(p: mi.Point3f, first: list[mi.Point3f], second: list[mi.Point3f], ac
 def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
     """Meshes whose boxes overlap that of another one: their numbers, and the box around all that they have in common
     with others, (2, 3)."""
-    boxes = [m.bbox() for m in geometry.meshes]
-    if len(boxes) < 2:
+    if len(geometry.meshes) < 2:
         return {}
-    lower, upper = (np.array([np.ravel(getattr(b, k)) for b in boxes], np.float64) for k in ("min", "max"))
+    lower, upper = np.array([[[*b.min], [*b.max]] for b in (m.bbox() for m in geometry.meshes)]).transpose(1, 0, 2)
     lower, upper = np.maximum(lower[:, None], lower[None]), np.minimum(upper[:, None], upper[None])
     overlap = (lower <= upper).all(2)
     np.fill_diagonal(overlap, False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -82,7 +83,7 @@ class BoundarySearch:
             self._media.refuse_gradients(self.who)
             limits = (*self._media.limits(), *self._partial.limits())
             geometry.refuse_moving_others(params, self.who)
-            moving = self._what_moves(scene, sensor, geometry)
+            moving = self._what_moves(scene, sensor, geometry, params)
         if not moving.anything:
             return Boundaries(limits=limits)
         if not dr.flag(dr.JitFlag.FreezingScope):
@@ -143,9 +144,11 @@ class BoundarySearch:
 
     # ---------------------- What moves ----------------------
 
-    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry) -> Moving:
+    def _what_moves(
+        self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry, params: mi.SceneParameters
+    ) -> Moving:
         moves = geometry.moving()
-        camera = any(dr.grad_enabled(value) for _, value in mi.traverse(sensor).items())
+        camera = any(dr.grad_enabled(value) for value in _parameters(sensor, params))
         if camera and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
             raise RuntimeError(
@@ -215,3 +218,12 @@ class BoundarySearch:
             # With the sensor, so that its number is given to no other one.
             self._beyond[key] = sensor, beyond_far_plane(sensor, list(moving.on_film))
         return self._beyond[key][1] if key in self._beyond else []
+
+
+def _parameters(sensor: mi.Sensor, params: mi.SceneParameters) -> list[Any]:
+    """Of a sensor, and of all that it is made of; taken from those of the scene, if it is a part of that."""
+    own = next((key for key, (_, _, node, _) in params.properties.items() if node is sensor), None)
+    if own is None:
+        return [value for _, value in mi.traverse(sensor).items()]
+    prefix = own.rpartition(".")[0] + "."
+    return [params[key] for key in params.properties if key.startswith(prefix)]
