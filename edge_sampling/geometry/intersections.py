@@ -318,10 +318,10 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
     with others, (2, 3)."""
     if len(geometry.meshes) < 2:
         return {}
-    lower, upper = np.array([[[*b.min], [*b.max]] for b in (m.bbox() for m in geometry.meshes)]).transpose(1, 0, 2)
-    lower, upper = np.maximum(lower[:, None], lower[None]), np.minimum(upper[:, None], upper[None])
+    boxes = np.array([[[*b.min], [*b.max]] for b in (m.bbox() for m in geometry.meshes)])
+    lower, upper = np.maximum(boxes[:, None, 0], boxes[:, 0]), np.minimum(boxes[:, None, 1], boxes[:, 1])
     overlap = (lower <= upper).all(2)
-    np.fill_diagonal(overlap, False)
+    overlap.ravel()[:: len(boxes) + 1] = False  # of each with itself
     return {i: np.array([lower[i, row].min(0), upper[i, row].max(0)]) for i, row in enumerate(overlap) if row.any()}
 
 

@@ -99,7 +99,7 @@ class BoundarySearch:
         if boundaries.shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
             boundaries.shading.boxes.find_shapes()
         limits += (*boundaries.limits, *self._limits_of_sensor(sensor, moving))
-        return replace(boundaries, limits=limits)
+        return replace(boundaries, limits=limits) if limits != boundaries.limits else boundaries
 
     # ---------------------- Edges ----------------------
 
@@ -223,7 +223,11 @@ class BoundarySearch:
 def _parameters(sensor: mi.Sensor, params: mi.SceneParameters) -> list[Any]:
     """Of a sensor, and of all that it is made of; taken from those of the scene, if it is a part of that."""
     own = next((key for key, (_, _, node, _) in params.properties.items() if node is sensor), None)
-    if own is None:
-        return [value for _, value in mi.traverse(sensor).items()]
-    prefix = own.rpartition(".")[0] + "."
-    return [params[key] for key in params.properties if key.startswith(prefix)]
+    prefix = "" if own is None else own.rpartition(".")[0] + "."
+    entries = (params if prefix else mi.traverse(sensor)).properties.items()
+    # Not `params[key]`, which takes the value's fingerprint besides.
+    return [
+        value if kind is None else mi.get_property(value, kind, node)
+        for key, (value, kind, node, _) in entries
+        if key.startswith(prefix)
+    ]
