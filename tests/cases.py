@@ -30,7 +30,7 @@ from building import (
 from cuts import CUTS
 from mirrors import MIRRORS
 from random_scenes import ball
-from rooms import ROOMS
+from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
 
 from rimlight.checks import FiniteDifferences, Motion, derivative_image, finite_differences
 
@@ -891,6 +891,8 @@ CASES = [
     Case("open_air", open_air, SIDE, 1e-2, spp=128, runs=96, integrator=prb_edge(3)),
     Case("sky_blocker", sky_blocker, BLOCKER_SIDE, 5e-2, spp=256, runs=48),
     *(Case(k, *of, spp=64, runs=12, integrator=prb_edge(4), reference_spp=4096) for k, of in ROOMS.items()),
+    Case("hidden_shadow", hidden_shadow, BOARD_ALONG, 1e-2, spp=128, runs=24, integrator=prb_edge(3)),
+    Case("box_behind_glass", box_behind_glass, BOX_ALONG, 1e-2, spp=256, runs=24, integrator=prb_edge(3)),
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096)
         for k, (*of, depth) in (CUTS | MIRRORS).items()

@@ -7,7 +7,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from building import camera, diffuse, horizontal, light, mesh, quad, scene
+from building import camera, constant, diffuse, horizontal, light, mesh, quad, scene
 from random_scenes import ball
 
 
@@ -105,6 +105,38 @@ def rough_panes() -> mi.Scene:
     panes = {"front": pane("front", 1), "back": pane("back", 0)}
     spot = {"type": "point", "position": [0.3, 0.8, 0.8], "intensity": 2.0}
     return scene(sensor=camera((0, 0, 2), (0, 0, 0)), **panes, plate=plate, lamp=lamp, spot=spot)
+
+
+def hidden_shadow() -> mi.Scene:
+    """The camera sees a wall, which is lit by a floor below the frame; on that falls the shadow of a black board. All
+    of the derivative comes from shadows in indirect light."""
+    spot = {
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f().look_at([0, 2.5, 0], [0, 0, 0], [0, 0, 1]),
+        "intensity": 20.0,
+        "cutoff_angle": 30.0,
+        "beam_width": 30.0,
+    }
+    return scene(
+        sensor=camera((0, 1.2, -4), (0, 1.2, 2), fov=24),
+        wall=quad((-2, 0, 1.2), (0, 3, 0), (4, 0, 0), "wall", bsdf=diffuse(0.7, 0.6, 0.5, two_sided=True)),
+        floor=horizontal((0, 0, 0), 1.2, "floor", bsdf=diffuse(0.6, 0.7, 0.8)),
+        board=horizontal((0.08, 2.2, 0.03), 0.1, "board", bsdf=diffuse(0, two_sided=True)),
+        spot=spot,
+    )
+
+
+def box_behind_glass() -> mi.Scene:
+    """A box well behind a pane of rough glass: its edges count beyond the vicinity of the glass."""
+    faces = "left right bottom top front back"
+    glass = {"type": "roughdielectric", "distribution": "ggx", "alpha": 0.3, "int_ior": 1.3}
+    return scene(
+        sensor=camera((0, 0, -2.5), (0, 0, 1), fov=30),
+        pane=quad((-1.5, -1.5, 0), (0, 3, 0), (3, 0, 0), "pane", bsdf=glass),
+        box=box((0.1, -0.1, 1.0), (0.3, 0.4, 0.3), faces, bsdf=diffuse(0.7, 0.6, 0.5, two_sided=True)),
+        back=quad((-3, -3, 2), (0, 6, 0), (6, 0, 0), "back", bsdf=diffuse(0.5, two_sided=True)),
+        sky=constant(),
+    )
 
 
 BOX_ALONG = {"key": "box.vertex_positions", "direction": [1, 0, 0]}

@@ -144,9 +144,7 @@ class BoundarySearch:
 
     # ---------------------- What moves ----------------------
 
-    def _what_moves(
-        self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry, params: mi.SceneParameters
-    ) -> Moving:
+    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry, params: mi.SceneParameters) -> Moving:
         moves = geometry.moving()
         camera = any(dr.grad_enabled(value) for value in _parameters(sensor, params))
         if camera and geometry.others:
