@@ -191,6 +191,8 @@ class FilmBoundary:
             # (Beside horizons, of which what hides an edge may have one, more than its shape matters.)
             hides = (scene, active & chosen.is_edge) if self.outlines.horizons is not None else ()
             active &= ~(chosen.is_edge & self.outlines.edges.is_hidden_fold(at.positions, chosen.edge, p, rays, *hides))
+        if self.outlines.edges is not None and self.outlines.edges.any_lines:
+            active &= ~self.outlines.edges.is_hidden_line(scene, chosen.edge, p, rays, active & chosen.is_edge)
         if self.outlines.horizons is not None:
             dark = self.outlines.horizons.sees_dark_side(scene, chosen.face, p, rays[0], active & chosen.is_horizon)
             active &= ~chosen.is_horizon | dark

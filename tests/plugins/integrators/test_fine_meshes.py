@@ -66,6 +66,44 @@ def test_glass(beside):
     assert_exact("rough_glass", cases.scene(sensor=sensor, lamp=lamp, ball=smooth, sky=cases.constant()), beside)
 
 
+def rough_ball() -> mi.Scene:
+    """A ball of 40,000 triangles, rough by a thousandth of its radius, above the frame: only its shadow is seen."""
+    points, _, _, faces = ball(100)
+    place = np.unique(np.round(points, 6), axis=0, return_inverse=True)[1].ravel()
+    radius = 0.5 + 5e-4 * np.random.default_rng(1).normal(size=place.max() + 1)[place]
+    return cases.scene(
+        sensor=cases.camera((0, 2, -5), fov=26, film=cases.film(width=16, height=16, pixel_format="luminance")),
+        ball=cases.mesh("ball", points * radius[:, None] + [0, 2, 0], faces, bsdf=cases.diffuse(0)),
+        floor=cases.horizontal((0, 0, 0), 4, "floor", bsdf=cases.diffuse(0.5)),
+        light=cases.horizontal(
+            (0.3, 6, -0.2), 0.2, "light", down=True, bsdf=cases.diffuse(0), emitter=cases.light(50, 50, 50)
+        ),
+    )
+
+
+def test_shadows_count_once():
+    """Many silhouettes of a rough mesh are hidden by others that are closer than rays need to look aside."""
+    assert_exact("rough_ball_shadow", rough_ball(), key="ball.vertex_positions")
+
+
+def test_lines_that_something_hides():
+    """A board passes through the side of a box, which the camera does not see, just behind its outline."""
+    corners = [[-1, -1, 0], [-1, 1, 0], [0, -1, 0], [0, 1, 0], [-2e-4, -1, 1], [-2e-4, 1, 1]]
+    box = cases.mesh(
+        "box",
+        corners,
+        [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]],
+        bsdf=cases.diffuse(0),
+        emitter=cases.light(1, 1, 1),
+    )
+    board = cases.quad(
+        (-0.5, -0.6, 0.2), (0, 1.2, 0.6), (1.2, 0, 0), "board", bsdf=cases.diffuse(0), emitter=cases.light(3, 3, 3)
+    )
+    film = cases.film(width=16, height=16, pixel_format="luminance")
+    scene = cases.scene(sensor=cases.camera((0, 0, -5), (0.05, 0, 0), fov=30, film=film), box=box, board=board)
+    assert_exact("hidden_line", scene, key="box.vertex_positions")
+
+
 def test_flipped_normals():
     """Of a coarse ball, whose horizon is well inside of its outline."""
     assert_exact("flipped_normals", glowing_ball(6, "perspective", cases.diffuse(0), flipped=True))
@@ -88,8 +126,8 @@ def test_light_of_coarse_lamps_backward(kind):
     assert backward == pytest.approx(forward, rel=2e-3)
 
 
-def assert_exact(name: str, scene: mi.Scene, ball_too: bool = False) -> None:
-    """Does the derivative of a lamp that is shifted agree with finite differences?
+def assert_exact(name: str, scene: mi.Scene, ball_too: bool = False, key: str = "lamp.vertex_positions") -> None:
+    """Does the derivative agree with finite differences, where vertices are shifted?
 
     ball_too : let the vertices of the ball carry a gradient, but stand still.
     """
@@ -97,7 +135,7 @@ def assert_exact(name: str, scene: mi.Scene, ball_too: bool = False) -> None:
         params = mi.traverse(scene)
         dr.enable_grad(params["ball.vertex_positions"])
         params.update()
-    motion = Motion(scene, "lamp.vertex_positions", direction=[1, 0.3, 0.2])
+    motion = Motion(scene, key, direction=[1, 0.3, 0.2])
     path = mi.load_dict({"type": "path", "max_depth": 2})
     reference = cases.stored_differences(
         name, [str(motion)], scene, motion, step=2e-3, runs=16, spp=4096, integrator=path
