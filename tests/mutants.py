@@ -174,7 +174,7 @@ MUTANTS = [
         "a, b, crossed = cut_by_plane(corners, depth)",
         "a, b, crossed = dr.detach(cut_by_plane(corners, depth))",
     ),
-    mutant("film boundary: looks 100 times as far aside", FILM, "in_world = 8 * ulp", "in_world = 800 * ulp"),
+    mutant("film boundary: looks 100 times as far aside", FILM, "in_world = ulps", "in_world = 100 * ulps"),
     mutant(
         "edges from points: not shared with the lights' samples",
         SHADING,
