@@ -224,6 +224,18 @@ MUTANTS = [
         "turn_to_viewer(si, vertex.ray, active & beside_outline)",
         "pass",
     ),
+    mutant(
+        "shadows: rays look as far beside the edges of fine meshes as beside others",
+        "edge_sampling/geometry/device_edges.py",
+        "return 0.25 * rounding(p, q)",
+        "return 6 * rounding(p, q)",
+    ),
+    mutant(
+        "film boundary: lines in which meshes cut each other count behind other meshes, too",
+        FILM,
+        "active &= ~self.outlines.edges.is_hidden_line(scene, chosen.edge, p, rays, active & chosen.is_edge)",
+        "pass",
+    ),
     # ---------------------- Chains ----------------------
     mutant(
         "shadows in indirect light: 2 % too large",
