@@ -37,7 +37,8 @@ class DeviceEdges:
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
     _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_is_line", "_glass", "_mask")
-    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "any_smooth", "any_farther", "any_lines", "_any_split", *_OF_EDGES))
+    _ANY = ("any_smooth", "any_farther", "any_lines", "_any_split")
+    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
         # Copied, since Dr.Jit maps NumPy's memory: two arrays on the same memory make `dr.freeze` record anew.
