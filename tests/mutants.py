@@ -225,13 +225,13 @@ MUTANTS = [
         "pass",
     ),
     mutant(
-        "shadows: rays look as far beside the edges of fine meshes as beside others",
+        "shadows: looks 24 times as far aside",
         "edge_sampling/geometry/device_edges.py",
         "return 0.25 * rounding(p, q)",
         "return 6 * rounding(p, q)",
     ),
     mutant(
-        "film boundary: lines in which meshes cut each other count behind other meshes, too",
+        "film boundary: lines in which meshes cut each other count where something hides them",
         FILM,
         "active &= ~self.outlines.edges.is_hidden_line(scene, chosen.edge, p, rays, active & chosen.is_edge)",
         "pass",

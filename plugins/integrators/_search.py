@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -83,7 +82,7 @@ class BoundarySearch:
             self._media.refuse_gradients(self.who)
             limits = (*self._media.limits(), *self._partial.limits())
             geometry.refuse_moving_others(params, self.who)
-            moving = self._what_moves(scene, sensor, geometry, params)
+            moving = self._what_moves(scene, sensor, geometry)
         if not moving.anything:
             return Boundaries(limits=limits)
         if not dr.flag(dr.JitFlag.FreezingScope):
@@ -144,9 +143,9 @@ class BoundarySearch:
 
     # ---------------------- What moves ----------------------
 
-    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry, params: mi.SceneParameters) -> Moving:
+    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry) -> Moving:
         moves = geometry.moving()
-        camera = any(dr.grad_enabled(value) for value in _parameters(sensor, params))
+        camera = any(dr.grad_enabled(value) for _, value in mi.traverse(sensor).items())
         if camera and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
             raise RuntimeError(
@@ -216,16 +215,3 @@ class BoundarySearch:
             # With the sensor, so that its number is given to no other one.
             self._beyond[key] = sensor, beyond_far_plane(sensor, list(moving.on_film))
         return self._beyond[key][1] if key in self._beyond else []
-
-
-def _parameters(sensor: mi.Sensor, params: mi.SceneParameters) -> list[Any]:
-    """Of a sensor, and of all that it is made of; taken from those of the scene, if it is a part of that."""
-    own = next((key for key, (_, _, node, _) in params.properties.items() if node is sensor), None)
-    prefix = "" if own is None else own.rpartition(".")[0] + "."
-    entries = (params if prefix else mi.traverse(sensor)).properties.items()
-    # Not `params[key]`, which takes the value's fingerprint besides.
-    return [
-        value if kind is None else mi.get_property(value, kind, node)
-        for key, (value, kind, node, _) in entries
-        if key.startswith(prefix)
-    ]

@@ -2,6 +2,7 @@
 
 import cases
 import drjit as dr
+import frozen
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -109,10 +110,8 @@ def test_terms_add_up():
 @pytest.fixture
 def one_thread():
     """Sums then have one order only: with several, atomic additions leave the last bits to chance."""
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(threads)
+    with frozen.one_thread():
+        yield
 
 
 @pytest.mark.parametrize("key", ["face0.vertex_positions", "sensor.to_world"])
