@@ -96,8 +96,8 @@ class Intersections:
             return False
         self._at = arrays
         before = self.meshes, self.capacity
-        boxes = _overlapping(geometry)
-        boxes.update(dict.fromkeys(self._by_themselves, np.array([[-np.inf] * 3, [np.inf] * 3])))
+        everywhere = {i: np.array([[-np.inf] * 3, [np.inf] * 3]) for i in self._by_themselves}
+        boxes = _overlapping(geometry) | everywhere
         self.meshes = meshes = tuple(sorted(boxes))
         if not meshes:
             self._keep([], 0)
@@ -318,10 +318,14 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
     with others, (2, 3)."""
     if len(geometry.meshes) < 2:
         return {}
-    boxes = np.array([[[*b.min], [*b.max]] for b in (m.bbox() for m in geometry.meshes)])
-    lower, upper = np.maximum(boxes[:, None, 0], boxes[:, 0]), np.minimum(boxes[:, None, 1], boxes[:, 1])
-    overlap = (lower <= upper).all(2)
+    boxes = np.array([(*b.min, *b.max) for b in (m.bbox() for m in geometry.meshes)])
+    lower, upper = boxes[:, :3], boxes[:, 3:]
+    overlap = (lower[:, None] <= upper).all(2)
+    overlap &= overlap.T
     overlap.ravel()[:: len(boxes) + 1] = False  # of each with itself
+    if not overlap.any():
+        return {}
+    lower, upper = np.maximum(lower[:, None], lower), np.minimum(upper[:, None], upper)
     return {i: np.array([lower[i, row].min(0), upper[i, row].max(0)]) for i, row in enumerate(overlap) if row.any()}
 
 

@@ -36,7 +36,8 @@ class Geometry:
         shapes = scene.shapes()
         meshes = tuple(s for s in shapes if s.is_mesh() and s.class_name() != "EllipsoidsMesh")
         analytic = tuple(s for s in shapes if s.class_name() in CURVES)
-        return Geometry(meshes, analytic, tuple(s for s in shapes if s not in meshes and s not in analytic))
+        known = {id(s) for s in (*meshes, *analytic)}
+        return Geometry(meshes, analytic, tuple(s for s in shapes if id(s) not in known))
 
     @property
     def line_vertices(self) -> int:
