@@ -106,9 +106,17 @@ def shown_by_mirror(
     return pi.compute_surface_interaction(turned, mi.RayFlags.All, active)
 
 
-def look_from(si: mi.SurfaceInteraction3f, x: mi.Point3f) -> None:
-    """Attach the direction in which a surface is looked at to the point x that looks."""
-    si.wi = dr.replace_grad(si.wi, si.to_local(dr.normalize(x - si.p)))
+def look_from(si: mi.SurfaceInteraction3f, x: mi.Point3f, ray: mi.Ray3f, t: mi.Float) -> None:
+    """Attach the direction in which a surface is looked at to the point x that looks, along a ray of the length t.
+
+    Only the motion across the ray turns it. That is projected out, rather than found from the normalised difference of
+    both points: where they are close to each other, rounding turns this difference, and of a motion along the ray, by
+    which points slide away from each other, a part would seem to go across it.
+    """
+    d, between = dr.detach(ray.d), si.p - x
+    across = between - d * dr.dot(d, between)
+    turn = (across - dr.detach(across)) / dr.select(t > 0, t, 1)
+    si.wi = dr.replace_grad(si.wi, si.to_local(-(d + turn)))
 
 
 def grazes(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Bool:

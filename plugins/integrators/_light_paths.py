@@ -120,7 +120,7 @@ class Place:
         si = surface(self.number, self.ray, self.pi)
         with dr.resume_grad(when=scattering.attached):
             if scattering.attached and self.before is not None and scattering.directional:
-                look_from(si, surface(self.number - 1, *self.before).p)
+                look_from(si, surface(self.number - 1, *self.before).p, self.ray, self.pi.t)
         if self.horizon is not None and self.number == 1:
             turn_to_side(si, self.ray, self.horizon)
         return si

@@ -57,7 +57,7 @@ class Chain:
             far = self.vicinity.far(dr.square(vertex.pi.t))
             si = sliding_point(ray, vertex.pi, dr.select(vertex.slides, 0, far), active)
             if self.scattering.directional:
-                look_from(si, ray.o)
+                look_from(si, ray.o, ray, vertex.pi.t)
             return si
 
     def along(self, log: Log, depth: mi.UInt32, si: mi.SurfaceInteraction3f, vertex: Vertex, active) -> mi.Ray3f:

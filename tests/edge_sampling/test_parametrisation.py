@@ -1,0 +1,61 @@
+"""What vertices of paths hold fixed, where they are close to each other: `parametrisation.py`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from building import diffuse, horizontal, scene
+
+from rimlight.edge_sampling.parametrisation import look_from, sliding_point
+
+#: Distance of the scene from the origin, where a unit in the last place is 0.002.
+FAR = 30_000.0
+
+#: Distances between two vertices: from twenty such units on.
+DISTANCES = np.geomspace(0.04, 400, 64)
+
+
+def turn(move, held=0.0):
+    """The derivative of the direction in which points of a floor are looked at, along rays that come down at 45° from
+    points in these distances, times the distance: (3, 64).
+
+    move : (θ, x, parameters) -> the point that looks; it may change the parameters. held : see `sliding_point`.
+    """
+    there = scene(floor=horizontal((FAR, 0, FAR), 1000, "floor", bsdf=diffuse(0.5)))
+    params, θ = mi.traverse(there), mi.Float(0)
+    dr.enable_grad(θ)
+    dr.set_grad(θ, 1)
+    d = mi.Vector3f(dr.sqrt(0.5), -dr.sqrt(0.5), 0)
+    x = mi.Point3f(mi.Float(FAR + 3.3 * np.arange(64)), mi.Float(DISTANCES * np.sqrt(0.5)), FAR)
+    ray = mi.Ray3f(x, d)
+    pi = there.ray_intersect_preliminary(ray)
+    assert dr.all(pi.is_valid())
+    ray.o = move(θ, x, params)
+    si = sliding_point(ray, pi, mi.Float(held), mi.Bool(True))
+    look_from(si, ray.o, ray, pi.t)
+    assert np.allclose(np.array(dr.detach(si.to_world(si.wi))), -np.array(d), atol=1e-6)
+    return np.array(dr.forward_to(si.to_world(si.wi))) * np.array(pi.t)
+
+
+def test_what_slides_away_along_the_ray_does_not_turn():
+    """The floor sinks as fast as the scene is far away: points that slide over it part from those that look at them.
+    The difference of points that close is rounding to a part, which must not turn the direction (by 500, it did)."""
+
+    def sink(θ, x, params):
+        p = dr.unravel(mi.Point3f, params["floor.vertex_positions"])
+        params["floor.vertex_positions"] = dr.ravel(p - mi.Vector3f(0, FAR, 0) * θ)
+        params.update()
+        return x
+
+    assert np.abs(turn(sink)).max() < 1e-5 * FAR
+
+
+@pytest.mark.parametrize("across", [(1, 1, 0), (0, 0, 1)])
+def test_what_moves_across_the_ray_turns(across):
+    """The point that looks moves across its ray. What slides goes along, and nothing turns; from a material point, that
+    point is seen in another direction, the more so the closer it is."""
+    moves = lambda θ, x, params: x + mi.Vector3f(across) * θ
+    assert np.abs(turn(moves)).max() < 1e-4
+    assert np.abs(turn(moves, held=1.0).T - across).max() < 1e-4
