@@ -150,9 +150,9 @@ MUTANTS = [
     mutant("tree of edges: not refitted", FOUND, "self.silhouettes.refit()", "pass"),
     mutant("edges: never found again", SEARCH, "        if same:\n", "        if self._sources is not None:\n"),
     mutant(
-        "film boundary: folds hidden by their own mesh count",
+        "film boundary: edges that lie behind another outline count",
         FILM,
-        "active &= ~(chosen.is_edge & self.outlines.edges.is_hidden_fold(at.positions, chosen.edge, p, rays, *hides))",
+        "jumps &= ~(chosen.is_edge & hidden)",
         "pass",
     ),
     mutant(
@@ -232,9 +232,21 @@ MUTANTS = [
     ),
     mutant(
         "film boundary: lines in which meshes cut each other count where something hides them",
-        FILM,
-        "active &= ~self.outlines.edges.is_hidden_line(scene, chosen.edge, p, rays, active & chosen.is_edge)",
-        "pass",
+        "edge_sampling/geometry/device_edges.py",
+        "return dr.select(line, self._is_hidden_line(p, rays, met), hidden) if self._any_lines else hidden",
+        "return hidden & ~line",
+    ),
+    mutant(
+        "film boundary: silhouettes that lie exactly behind others count",
+        "edge_sampling/geometry/device_edges.py",
+        "~(shown[0] & shown[1]), covered & ~(shown[0] | shown[1]))",
+        "~(shown[0] & shown[1]), False)",
+    ),
+    mutant(
+        "film boundary: a face that is seen edge-on faces away for one of its borders only",
+        "edge_sampling/geometry/device_edges.py",
+        "(-dr.dot(second, towards) > least * dr.norm(second))",
+        "(-dr.dot(second, towards) > -least * dr.norm(second))",
     ),
     # ---------------------- Chains ----------------------
     mutant(

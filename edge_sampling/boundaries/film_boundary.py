@@ -55,6 +55,7 @@ class BoundaryPoints:
     n_dl     : mi.Vector2f, (N,), n dl over the density of the points, pixels; zero where there is none. Detached.
     velocity : mi.Vector2f, (N,), zero, with the gradient du/dθ of the position.
     rays     : that look beside the edge, on its − and on its + side.
+    met      : what they meet.
     weights  : of these rays.
     active   : mi.Bool, (N,)
     horizons : on which side of a horizon of interpolated normals each of the rays is; None where there are none.
@@ -66,6 +67,7 @@ class BoundaryPoints:
     n_dl: mi.Vector2f
     velocity: mi.Vector2f
     rays: list[mi.RayDifferential3f]
+    met: list[mi.PreliminaryIntersection3f]
     weights: list[mi.Spectrum]
     active: mi.Bool
     horizons: list[Horizon | None]
@@ -127,11 +129,11 @@ class FilmBoundary:
         it, and folds of faces that are narrower on the film do not count.
         """
         with dr.suspend_grad():
-            points = self.points(tracer.scene, sensor, sampler, count)
+            points = self.points(tracer, sensor, sampler, count)
             jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
-            sides = zip((-1, 1), points.rays, points.weights, points.horizons, strict=True)
-            for sign, ray, weight, horizon in sides:
-                L, alpha = tracer.seen(ray, sampler.clone(), points.active, horizon, points.lune)
+            sides = zip((-1, 1), points.rays, points.met, points.weights, points.horizons, strict=True)
+            for sign, ray, pi, weight, horizon in sides:
+                L, alpha = tracer.seen(ray, pi, sampler.clone(), points.active, horizon, points.lune)
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
             if points.sensor_moves:
@@ -142,9 +144,9 @@ class FilmBoundary:
             wavelengths = points.rays[1].wavelengths
             return BoundarySamples(points.position, jump * normal_velocity, alpha_jump * normal_velocity, wavelengths)
 
-    def points(self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler, count: int) -> BoundaryPoints:
+    def points(self, tracer: Tracer, sensor: mi.Sensor, sampler: mi.Sampler, count: int) -> BoundaryPoints:
         """Points of the film boundary, of which `sample` makes samples."""
-        outlines = self.outlines
+        outlines, scene = self.outlines, tracer.scene
         with dr.resume_grad():
             at = outlines.placed(sensor)
         with dr.suspend_grad():
@@ -174,36 +176,41 @@ class FilmBoundary:
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             offset = self._offset(scene, at, p, chosen) * dr.normalize(n_dl)
             rays, weights = _beside(at, sensor, sampler, u, offset, active)
-            active = self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, active)
+            met = [tracer.first_hit(ray, active) for ray in rays]
+            active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
             n_dl = dr.select(active, n_dl, 0)
             lune = outlines.lune(at, chosen, lights)
-            return BoundaryPoints(u, n_dl, velocity, rays, weights, active, horizons, lune, at.projection.attached)
+            return BoundaryPoints(u, n_dl, velocity, rays, met, weights, active, horizons, lune, at.projection.attached)
 
     # ---------------------- What is on their sides ----------------------
 
-    def _jumps_between(self, scene, at: Placed, chosen: Chosen, found: Found, p, n, rays, active) -> mi.Bool:
+    def _jumps_between(self, at: Placed, chosen: Chosen, found: Found, p, n, rays, met) -> mi.Bool:
         """Is what jumps between two rays beside the points a jump of theirs, and not of another outline close by?
 
-        p : the points. n : unit normals on the film, from the first ray to the second.
+        p : the points. n : unit normals on the film, from the first ray to the second. met : what the rays meet.
         """
-        if self.outlines.edges is not None:
-            # (Beside horizons, of which what hides an edge may have one, more than its shape matters.)
-            hides = (scene, active & chosen.is_edge) if self.outlines.horizons is not None else ()
-            active &= ~(chosen.is_edge & self.outlines.edges.is_hidden_fold(at.positions, chosen.edge, p, rays, *hides))
-        if self.outlines.edges is not None and self.outlines.edges.any_lines:
-            active &= ~self.outlines.edges.is_hidden_line(scene, chosen.edge, p, rays, active & chosen.is_edge)
-        if self.outlines.horizons is not None:
-            dark = self.outlines.horizons.sees_dark_side(scene, chosen.face, p, rays[0], active & chosen.is_horizon)
-            active &= ~chosen.is_horizon | dark
-        if self.outlines.curves is not None:
+        jumps, outlines, projection = mi.Bool(True), self.outlines, at.projection
+        if outlines.edges is not None:
+            view = projection.view() if projection.orthographic else None
+            eye = projection.eye(at.aperture_sample)
+            surfaces = [
+                pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, chosen.is_edge)
+                for ray, pi in zip(rays, met, strict=True)
+            ]
+            hidden = outlines.edges.is_hidden(at.positions, chosen.edge, p, eye, view, rays, surfaces)
+            jumps &= ~(chosen.is_edge & hidden)
+        if outlines.horizons is not None:
+            dark = outlines.horizons.sees_dark_side(chosen.face, p, rays[0], met[0], chosen.is_horizon)
+            jumps &= ~chosen.is_horizon | dark
+        if outlines.curves is not None:
             # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
             # that: a jump of the contour's, which would count twice.
             c = found.curve
-            wall = at.projection.tangent(c.p, mi.Point3f(c.p + c.inwards), mi.Float(0), at.aperture_sample)
-            missed = [self.outlines.curves.misses(at.frames, chosen.piece, ray) for ray in rays]
-            active &= ~chosen.is_curve | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
-        return active
+            wall = projection.tangent(c.p, mi.Point3f(c.p + c.inwards), mi.Float(0), at.aperture_sample)
+            missed = [outlines.curves.misses(at.frames, chosen.piece, ray) for ray in rays]
+            jumps &= ~chosen.is_curve | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
+        return jumps
 
     def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays) -> list[Horizon | None]:
         """On which side of a horizon of interpolated normals each of two rays is."""

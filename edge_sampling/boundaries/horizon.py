@@ -160,11 +160,13 @@ class Horizons:
         follows = t - dr.select(valid, (now - dr.detach(now)) / dr.select(valid, dr.detach(g_t), 1), 0)
         return HorizonPoint(mi.Point3f(p[0] + follows * D), dr.detach(tangent), dr.detach(facing), valid)
 
-    def sees_dark_side(self, scene: mi.Scene, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, active) -> mi.Bool:
+    def sees_dark_side(
+        self, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active
+    ) -> mi.Bool:
         """Do rays that pass points of curves on their dark side see the faces in which these are, or at least a surface
         that is dark? Not so beside a silhouette that is closer than the rays look, which has this jump already; nor
-        where something hides the face, be it the next one of the same mesh. Detached."""
-        si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
+        where something hides the face, be it the next one of the same mesh. pi : what the rays meet. Detached."""
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o)
         its_face = there & (si.prim_index == dr.gather(mi.UInt32, self._number, face))
         return si.is_valid() & (its_face | (dr.dot(si.sh_frame.n, ray.d) > 0))

@@ -53,10 +53,16 @@ class Tracer(Protocol):
         """What the sensor sees along camera rays."""
 
     def seen(
-        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None, lune: Lune | None
+        self,
+        ray: mi.Ray3f,
+        pi: mi.PreliminaryIntersection3f,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+        horizon: Horizon | None,
+        lune: Lune | None,
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Radiance and alpha along camera rays, of which the first hit is on a side of a horizon. Where there is a
-        lune, only light from there need be reflected: what else there is does not jump."""
+        """Radiance and alpha along camera rays, of which the first hit, `pi`, is on a side of a horizon. Where there is
+        a lune, only light from there need be reflected: what else there is does not jump."""
 
     def scattered(
         self,

@@ -14,6 +14,10 @@ from .meshes import Geometry, bends_light, lets_rays_through
 #: Faces whose normals differ by less (sine of the angle) count as coplanar; vertex normals, as equal.
 COPLANAR = 1e-5
 
+#: Faces are seen edge-on, and so face away, if the sine of the angle between them and the line of sight is at most so
+#: large.
+EDGE_ON = 1e-6
+
 #: How far beside the edges of glass to look, in units of the offset of rays that start there, times the cotangent of
 #: the angle between the faces: closer, rays through the mesh start beyond the other face.
 BEHIND = 8
@@ -36,8 +40,8 @@ class DeviceEdges:
     """
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
-    _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_is_line", "_glass", "_mask")
-    _ANY = ("any_smooth", "any_farther", "any_lines", "_any_split")
+    _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
+    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split")
     DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
@@ -51,13 +55,14 @@ class DeviceEdges:
         #: Are there edges with interpolated normals?
         self.any_smooth = not self._kinds.isdisjoint({EdgeKind.SMOOTH, EdgeKind.SPLIT})
         self._two_faces = mi.Bool(edges.count == 2)
+        self._few_faces = mi.Bool(edges.count <= 2)
         self._is_line = mi.Bool(np.array(edges.is_line))
         glass, mask = (np.array([is_so(m) for m in geometry.meshes])[edges.mesh].any(1) for is_so in KINDS)
         self._glass, self._mask = mi.Bool(glass & ~edges.is_line), mi.Bool(mask & ~edges.is_line)
         #: Is there an edge beside which `farther` is not 0?
         self.any_farther = bool((glass | mask | edges.is_line).any())
         #: Are there lines in which meshes cut through each other?
-        self.any_lines = bool(edges.is_line.any())
+        self._any_lines = bool(edges.is_line.any())
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
@@ -84,49 +89,64 @@ class DeviceEdges:
         """The third vertex of the face on each side, world space."""
         return [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, o, edge)) for o in self._opposite]
 
-    def is_hidden_fold(
+    def is_hidden(
         self,
         positions: mi.Float,
         edge: mi.UInt32,
         p: mi.Point3f,
-        rays: tuple[mi.Ray3f, mi.Ray3f],
-        scene: mi.Scene | None = None,
-        active: mi.Bool = True,
+        eye: mi.Point3f,
+        view: mi.Vector3f | None,
+        rays: list[mi.Ray3f],
+        met: list[mi.SurfaceInteraction3f],
     ) -> mi.Bool:
-        """Do two rays, close by on both sides of an edge that is no silhouette, miss its faces?
+        """Do two rays, close by on both sides of an edge, meet something else than what joins there?
 
-        Then a face is seen at so grazing an angle that the ray has left it, and met what lies beyond its other edges:
-        a jump that is theirs, and would count twice.
+        What jumps between them is another outline's then, and would count twice: one that lies on the film where the
+        edge does, as in views along an axis of symmetry, or so close to it that it passes between the rays. Of an edge
+        that is no silhouette, both faces must be seen, which excludes those at so grazing an angle that a ray has left
+        its face, and met what lies beyond the face's other edges. A silhouette must be seen if a ray passes through
+        both of its faces, as it does unless one is narrower than the rays are apart.
 
-        p : a point of the edge that the rays pass, world space.
-        scene : where given, rays miss faces that something else hides, too: on fine meshes, that may end between them.
+        p : a point of the edge that the rays pass, world space. eye, view : see `is_boundary`.
+        met : what the rays meet. What lets rays through hides nothing.
         """
         a, b = self.end_points(positions, edge)
-        fold = self.is_fold(positions, edge, p, line_of_sight(p, rays))
-        met = [None if scene is None else r(scene.ray_intersect_preliminary(r, active & fold).t) for r in rays]
-        passed = [mi.Bool(False), mi.Bool(False)]
-        for o in self.opposite(positions, edge):
-            n = dr.normalize(dr.cross(b - a, o - a))
-            for k, (ray, q) in enumerate(zip(rays, met, strict=True)):
-                there = True if q is None else dr.abs_dot(n, q - p) <= rounding(p, ray.o)
-                passed[k] |= passes(ray, [a, b, o]) & there
-        return fold & ~(passed[0] & passed[1])
+        normals = [dr.normalize(dr.cross(b - a, o - a)) for o in self.opposite(positions, edge)]
+        covers, shown = [], []
+        for ray, si in zip(rays, met, strict=True):
+            through = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
+            slack = rounding(p, ray.o)
+            passed = [passes(ray, [a, b, o]) for o in self.opposite(positions, edge)]
+            there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
+            covers.append(passed[0] & passed[1])
+            shown.append((passed[0] & there[0]) | (passed[1] & there[1]))
+        fold = dr.gather(mi.Bool, self._two_faces, edge) & ~self.is_silhouette(positions, edge, eye, view)
+        line = dr.gather(mi.Bool, self._is_line, edge)
+        covered = dr.gather(mi.Bool, self._few_faces, edge) & (covers[0] | covers[1])
+        hidden = dr.select(fold, ~(shown[0] & shown[1]), covered & ~(shown[0] | shown[1]))
+        return dr.select(line, self._is_hidden_line(p, rays, met), hidden) if self._any_lines else hidden
 
-    def is_hidden_line(
-        self, scene: mi.Scene, edge: mi.UInt32, p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f], active: mi.Bool
-    ) -> mi.Bool:
-        """Does one of two rays, close by on both sides of a line in which meshes cut through each other, miss both?
-
-        Then the line lies behind something, whose outline may run between the rays: a jump that is not the line's, and
-        would count twice. What lets rays through hides nothing.
-        """
-        active = active & dr.gather(mi.Bool, self._is_line, edge)
+    def _is_hidden_line(self, p: mi.Point3f, rays, met) -> mi.Bool:
+        """Does one of two rays beside a line in which meshes cut through each other miss both?"""
         missed = mi.Bool(False)
-        for ray in rays:
-            si = scene.ray_intersect(ray, mi.RayFlags.Minimal, True, active)
+        for ray, si in zip(rays, met, strict=True):
             there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o)
             missed |= ~si.is_valid() | ~(there | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null))
-        return active & missed
+        return missed
+
+    def is_silhouette(
+        self, positions: mi.Float, edge: mi.UInt32, eye: mi.Point3f, view: mi.Vector3f | None = None
+    ) -> mi.Bool:
+        """Does one of the two faces face the eye, and the other not? See `is_boundary`.
+
+        A face that is seen exactly edge-on, up to rounding, faces away, whichever of its edges is asked: so just one
+        of its two borders is a silhouette.
+        """
+        a, _ = self.end_points(positions, edge)
+        towards = -view if view is not None else eye - a
+        first, second = self.normals(positions, edge)
+        least = EDGE_ON * dr.norm(towards)
+        return (dr.dot(first, towards) > least * dr.norm(first)) != (-dr.dot(second, towards) > least * dr.norm(second))
 
     def is_fold(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, sight: mi.Vector3f) -> mi.Bool:
         """Do edges have faces on both sides, as seen along a line of sight through a point p of theirs?"""
@@ -227,14 +247,12 @@ class DeviceEdges:
         boundary = kind == int(EdgeKind.JUMP)
         if self._kinds <= {EdgeKind.JUMP}:
             return boundary
+        boundary |= self.is_silhouette(positions, edge, eye, view)
         a, _ = self.end_points(positions, edge)
-        towards = -view if view is not None else eye - a
-        normal, sign = self.normals(positions, edge), []
+        normal = self.normals(positions, edge)
         for n in normal:
-            sign.append(dr.dot(n, towards))
-            # Rounding, and a lens that sees around the edge, leave the sign open: such an edge is taken.
-            boundary |= dr.abs(sign[-1]) <= dr.norm(n) * (radius + 1e-6 * dr.norm(towards))
-        boundary |= sign[0] * sign[1] > 0
+            # A lens sees around the edge.
+            boundary |= dr.abs(dr.dot(n, -view if view is not None else eye - a)) < dr.norm(n) * radius
         if geometry is not None and EdgeKind.FLAT in self._kinds:
             # By unit vectors: products of lengths could overflow in large scenes.
             folded = dr.norm(dr.cross(dr.normalize(normal[0]), dr.normalize(normal[1]))) > COPLANAR

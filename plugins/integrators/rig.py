@@ -198,7 +198,7 @@ class RigIntegrator(EdgeIntegrator):
         """Visibility as seen from the sensor, on one part of its film: all lights, on both sides of the edges."""
         count, seed = job.counts.on_line(part.sensor.film()), seed_of("film boundary", job.seed, i)
         sampler = in_a_row(job.sensor, seed, count)
-        points = job.boundaries.film.points(job.tracer.scene, part.sensor, sampler, count)
+        points = job.boundaries.film.points(job.tracer, part.sensor, sampler, count)
         position = part.to_film(points.position)
         with dr.resume_grad():
             normal_velocity = dr.dot(points.n_dl, points.velocity) * part.area

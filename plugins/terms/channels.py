@@ -53,7 +53,7 @@ class ChannelsOnFilmTerm(FilmTerm):
     def _samples(self, job: Job, i: int, part: FilmPart) -> FilmSamples:
         tracer, count = job.tracer, job.counts.on_line(part.sensor.film())
         sampler = in_a_row(job.sensor, seed_of("film boundary", job.seed, i), count)
-        points = job.boundaries.film.points(tracer.scene, part.sensor, sampler, count)
+        points = job.boundaries.film.points(tracer, part.sensor, sampler, count)
         shown = [points.active & dr.any(weight != 0) for weight in points.weights]
         rays = [tracer.sized(ray) for ray in points.rays]
         sides = [tracer.values(ray, on, attached=False) for ray, on in zip(rays, shown, strict=True)]

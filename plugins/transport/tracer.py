@@ -71,9 +71,11 @@ class PathTracer:
         attached: bool,
         horizon: Horizon | None = None,
         lune: Lune | None = None,
+        pi: mi.PreliminaryIntersection3f | None = None,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
 
+        pi : their first hits, if these are known.
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
         lune : see `Scattering.scatter`, for the first hit.
         """
@@ -83,7 +85,7 @@ class PathTracer:
 
         # ---------------------- First hit ----------------------
 
-        pi = self.first_hit(ray, active)
+        pi = self.first_hit(ray, active) if pi is None else pi
         si = seen_by_camera(ray, pi, active, attached=attached)
         if horizon is not None:
             turn_to_side(si, ray, horizon)
@@ -130,10 +132,16 @@ class PathTracer:
         return pi
 
     def seen(
-        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool, horizon: Horizon | None, lune: Lune | None
+        self,
+        ray: mi.Ray3f,
+        pi: mi.PreliminaryIntersection3f,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+        horizon: Horizon | None,
+        lune: Lune | None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, detached."""
-        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, lune=lune)
+        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, lune=lune, pi=pi)
         return found.L, dr.select(found.valid, mi.Float(1), 0)
 
     # ---------------------- From points of a path ----------------------
