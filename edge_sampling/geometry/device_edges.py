@@ -41,7 +41,7 @@ class DeviceEdges:
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
     _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
-    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split")
+    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_through")
     DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
@@ -63,6 +63,9 @@ class DeviceEdges:
         self.any_farther = bool((glass | mask | edges.is_line).any())
         #: Are there lines in which meshes cut through each other?
         self._any_lines = bool(edges.is_line.any())
+        shapes = (*geometry.meshes, *geometry.analytic, *geometry.others)
+        #: Is there a surface that lets rays through?
+        self._any_through = any(lets_rays_through(s) for s in shapes)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
@@ -114,7 +117,7 @@ class DeviceEdges:
         normals = [dr.normalize(dr.cross(b - a, o - a)) for o in self.opposite(positions, edge)]
         covers, shown = [], []
         for ray, si in zip(rays, met, strict=True):
-            through = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
+            through = self._lets_through(si)
             slack = rounding(p, ray.o)
             passed = [passes(ray, [a, b, o]) for o in self.opposite(positions, edge)]
             there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
@@ -131,8 +134,14 @@ class DeviceEdges:
         missed = mi.Bool(False)
         for ray, si in zip(rays, met, strict=True):
             there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o)
-            missed |= ~si.is_valid() | ~(there | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null))
+            missed |= ~(si.is_valid() & there) & ~self._lets_through(si)
         return missed
+
+    def _lets_through(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Can rays go through a surface as if nothing was there?"""
+        if not self._any_through:
+            return mi.Bool(False)
+        return si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
 
     def is_silhouette(
         self, positions: mi.Float, edge: mi.UInt32, eye: mi.Point3f, view: mi.Vector3f | None = None
