@@ -163,7 +163,7 @@ class ShadingBoundary:
                 r2 = dr.squared_norm(d)
                 f = bsdf.eval(mi.BSDFContext(), si, si.to_local(dr.normalize(d)), active)
                 arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
-                seen_past = outline.outward(dr.cross(d, outline.tangent)) != 0
+                seen_past = outline.outward(dr.cross(d, outline.tangent), d) != 0
                 crease = self.silhouettes.crease(e, outline) * (1 - vicinity.far(r2))
                 return dr.max(f) * arc * dr.select(seen_past | outline.is_line, 1, crease)
 
@@ -234,7 +234,7 @@ class ShadingBoundary:
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
             active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
-            outward = outline.outward(across)
+            outward = outline.outward(across, ω)
             if self.silhouettes.lines is not None:
                 # Beside a line in which meshes cut through each other, both sides slide past it. One of them is looked
                 # at, by chance.

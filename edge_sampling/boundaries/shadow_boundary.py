@@ -197,7 +197,7 @@ class ShadowBoundary:
         d = dr.select(far, -mi.Vector3f(y), outline.p - y)
         ω = dr.normalize(d)
         across = dr.normalize(dr.cross(ω, outline.tangent))
-        lit = across * outline.outward(across)
+        lit = across * outline.outward(across, ω)
         emits = dr.select(light.on_surface, dr.dot(light.n, ω), 1) > 0
         return _Edge(e, outline.p, outline.tangent, lit, d, ω, active & (e.density > 0) & emits & dr.any(lit != 0))
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.geometry.curves import PIECES, Curves
-from rimlight.edge_sampling.geometry.device_edges import beside_edge
+from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
 
@@ -53,13 +53,18 @@ class OutlinePoint:
         """Normals of the faces on both sides of an edge: of equal sense, not normalised."""
         return dr.cross(self.tangent, self.inwards[0]), dr.cross(self.inwards[1], self.tangent)
 
-    def outward(self, across: mi.Vector3f) -> mi.Float:
+    def outward(self, across: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
         """The side of a silhouette on which its faces are not: the sign of `across`, (N,); 0 where they are on both.
 
-        across : a direction across the edge and the line of sight.
+        A face that is seen edge-on faces away, as `DeviceEdges.is_silhouette` has it.
+
+        across : a direction across the edge and the line of sight. d : along that, from the viewer.
         """
-        sides = [dr.sign(dr.dot(v, across)) for v in self.inwards]
-        return dr.select(sides[0] == sides[1], -sides[0], 0)
+        least = EDGE_ON * dr.norm(d)
+        faces = [-dr.dot(n, d) > least * dr.norm(n) for n in self.normals]
+        inwards = [dr.dot(v, across) for v in self.inwards]
+        inwards = dr.select(dr.abs(inwards[0]) > dr.abs(inwards[1]), inwards[0], inwards[1])
+        return dr.select(faces[0] != faces[1], -dr.sign(inwards), 0)
 
 
 class Silhouettes:

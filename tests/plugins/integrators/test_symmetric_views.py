@@ -9,7 +9,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, film, mesh, scene
+from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, film, horizontal, mesh, scene
 from random_scenes import ball
 
 from rimlight.checks import Motion, derivative_image
@@ -72,5 +72,22 @@ def test_hidden_edges_do_not_count(name):
     size = np.abs(turned.mean(0)).sum()
     noise = np.abs((turned[::2].mean(0) - turned[1::2].mean(0)) / 2).sum() / size
     assert noise < 0.03
-    print(name, noise, np.abs(straight.mean(0) - turned.mean(0)).sum() / size)
     assert np.abs(straight.mean(0) - turned.mean(0)).sum() / size < 0.02 + 2 * noise
+
+
+def test_box_in_the_sun_straight_above():
+    """Four of its faces are seen edge-on by the sun: just one border of each throws a shadow."""
+
+    def derivative(turn):
+        lamp = {"type": "directional", "direction": [np.sin(turn), -1, np.sin(1.3 * turn)], "irradiance": 20.0}
+        floor = horizontal(PLACE - [0, 1.2, 0], 3, "floor", bsdf=diffuse(0.5))
+        there = scene(view=camera((1, 4, -5), film=film("gaussian")), sun=lamp, cube=cube(), floor=floor)
+        motion = Motion(there, "cube.vertex_positions", direction=[1, 0, 0.3])
+        # Without what the camera sees of the box itself.
+        integrator = mi.load_dict({"type": "direct_edge", "sppc": 0, "sppp": 0})
+        runs = [np.array(derivative_image(there, integrator, motion, spp=SPP, seed=s)) for s in range(RUNS)]
+        return np.mean(runs, axis=0)
+
+    straight, turned = derivative(0), derivative(TURN)
+    assert np.abs(turned).sum() > 1
+    assert np.abs(straight - turned).sum() / np.abs(turned).sum() < 0.03
