@@ -131,6 +131,13 @@ def checkerboard() -> mi.Scene:
     return board(type="twosided", nested={"type": "diffuse", "reflectance": checkers()})
 
 
+def close_up() -> mi.Scene:
+    """A large floor, of which the camera sees few squares: rounding of texture coordinates is large on the film."""
+    floor = {"type": "rectangle", "id": "floor", "bsdf": {"type": "diffuse", "reflectance": checkers(scale=(5, 5))}}
+    floor["to_world"] = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
+    return scene(sensor=camera((3.6, 0.8, -4.0), (3.2, 0, -3.2)), floor=floor, sky=constant(0.6))
+
+
 def nearest() -> mi.Scene:
     return board(type="twosided", nested={"type": "diffuse", "reflectance": texels(3)})
 
@@ -242,6 +249,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "smooth_mirror": (smooth_mirror, MESH, 2e-3, 3),
     "checkerboard": (checkerboard, BOARD, 2e-3, 2),
     "checkerboard_camera": (checkerboard, CAMERA, 2e-3, 3),
+    "checkerboard_close": (close_up, CAMERA, 1e-3, 2),
     "nearest_texels": (nearest, BOARD, 2e-3, 2),
     "leaf": (leaf, LEAF, 2e-3, 3),
     "veil_and_mirror": (veil, LEAF, 2e-3, 4),

@@ -248,6 +248,12 @@ MUTANTS = [
         "(-dr.dot(second, towards) > least * dr.norm(second))",
         "(-dr.dot(second, towards) > -least * dr.norm(second))",
     ),
+    mutant(
+        "lines of textures: looked at as closely as they are found",
+        "plugins/terms/bisection.py",
+        "aside = dr.select(at.on_texture, BESIDE_TEXTURE",
+        "aside = dr.select(at.on_texture, 0 * BESIDE_TEXTURE",
+    ),
     # ---------------------- Chains ----------------------
     mutant(
         "shadows in indirect light: 2 % too large",

@@ -27,6 +27,8 @@ class MappedHorizon:
     bsdf: mi.BSDF
     texture: Any
     two_sided: bool
+    #: Largest value of the function.
+    size: float = 1.0
 
     @property
     def turns(self) -> bool:

@@ -26,6 +26,11 @@ class Lattice:
     shape: Any
     matrix: np.ndarray
 
+    @property
+    def size(self) -> float:
+        """Largest coordinate in it of texture coordinates up to 1."""
+        return float(np.abs(self.matrix).sum(1).max())
+
     def at(self, si: mi.SurfaceInteraction3f) -> mi.Vector2f:
         """Place in the lattice; attached, if the texture coordinates are."""
         (a, b, c), (d, e, f) = self.matrix.tolist()
@@ -49,13 +54,15 @@ class TextureLines:
     shapes : those that count.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(())  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("_sizes",))  # for `dr.freeze`
 
     def __init__(self, shapes: Sequence[Any]):
         # Of each shape, lattices last, since the last line counts where several are found: the slopes of bump maps jump
         # there, and so may whether they turn away.
         of_shapes = [(s, [*mapped_horizons(s), *(Lattice(s, m) for m in _matrices(s))]) for s in shapes]
         self.kinds = [kind for _, kinds in of_shapes for kind in kinds]
+        #: The largest value of each function where the texture coordinates are at most 1.
+        self._sizes = mi.Float([k.size for k in self.kinds] or [1])
         numbers = iter(range(len(self.kinds)))
         #: Shapes, and the numbers of their functions.
         self._shapes = [(s, [next(numbers) for _ in kinds]) for s, kinds in of_shapes if kinds]
@@ -85,6 +92,11 @@ class TextureLines:
         """The function that is whole at a line; attached, if `si` is."""
         at = self._at(line.kind, si, True)
         return dr.select(line.second, at.y, at.x)
+
+    def rounding(self, line: Line, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """A unit in the last place of the function that is whole at a line. Detached."""
+        size = dr.gather(mi.Float, self._sizes, line.kind)
+        return dr.epsilon(mi.Float) * dr.maximum(size, dr.abs(dr.detach(self.across(line, si))))
 
     def _of(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.UInt32, mi.Bool]]:
         """The functions of the shape of a point, one after the other: their numbers, and whether it has so many."""

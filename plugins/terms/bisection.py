@@ -39,6 +39,9 @@ LONGEST, SHORTEST = 1.0, 16
 #: most before. All numbers are equally likely: near corners, the variance is the sum of their reciprocal probabilities.
 HIDDEN, HALVINGS = 4, 7
 
+#: How far beside lines of textures to look, in units in the last place of the coordinates in which they are whole.
+BESIDE_TEXTURE = 256
+
 #: What is looked for, in plans.
 WHAT = ("perfect mirrors or glass", "textures that jump")
 
@@ -177,23 +180,30 @@ def _at_outline(scene: mi.Scene, at: Parting, segment: Segment) -> tuple[Touch, 
 
 
 def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch, mi.Float, mi.Float] | None) -> Parting:
-    """What is seen on both sides of an outline, a little farther aside than it is known.
+    """What is seen on both sides of a jump, a little farther aside than it is known.
 
     Close to the edges of mirrors and glass, and to lines in which surfaces cut each other, rays start beyond the other
-    surface. This looks past that, unless other faces are there.
+    surface. Close to a line of a texture, rounding may put both rays on the same side of it when the texture is
+    evaluated. This looks past that, unless other faces are there.
     """
-    if outline is None:
-        return at
-    touch, along, _ = outline
-    edge = at.found & ~at.on_texture & ~at.grazes
-    lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, dr.select(touch.cut, BESIDE_LINE, 0))
-    aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
-    edge &= (lifts > 0) & (aside < LONGEST)
-    aside = dr.select(edge, aside, 0)
+    aside = dr.zeros(mi.Float, dr.width(at.found))
+    if outline is not None:
+        touch, along, _ = outline
+        lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, dr.select(touch.cut, BESIDE_LINE, 0))
+        aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
+        aside = dr.select(~at.on_texture & ~at.grazes, aside, 0)
+    if chains.textures is not None:
+        line, along, _ = _at_line(chains.textures, at)
+        si = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, at.found & at.on_texture)
+        aside = dr.select(at.on_texture, BESIDE_TEXTURE * chains.textures.rounding(line, si) / dr.abs(along), aside)
+    wanted = at.found & (aside > 0) & (aside < LONGEST)
+    aside = dr.select(wanted, aside, 0)
     wide = replace(segment, start=segment.start - aside * segment.axis, length=segment.length + 2 * aside)
-    other = chains.part((chains.first(wide.start, edge), chains.first(wide.end, edge)), wide, edge, None)
-    same = lambda v, w: (v.pi.shape == w.pi.shape) & (v.pi.prim_index == w.pi.prim_index) & (v.depth == w.depth)
-    usable = edge & other.found & same(at.a, other.a) & same(at.b, other.b)
+    other = chains.part((chains.first(wide.start, wanted), chains.first(wide.end, wanted)), wide, wanted, None)
+    usable = wanted & other.found
+    for v, w in ((at.a, other.a), (at.b, other.b)):
+        same_face = (v.pi.prim_index == w.pi.prim_index) | at.on_texture
+        usable &= (v.pi.shape == w.pi.shape) & same_face & (v.depth == w.depth)
     a, b = (dr.select(usable, new, old) for new, old in ((other.a, at.a), (other.b, at.b)))
     return replace(at, a=a, b=b)
 
