@@ -132,7 +132,7 @@ def checkerboard() -> mi.Scene:
 
 
 def close_up() -> mi.Scene:
-    """A large floor, of which the camera sees few squares: rounding of texture coordinates is large on the film."""
+    """A large floor, of which the camera sees few squares: few texture coordinates differ within a pixel."""
     floor = {"type": "rectangle", "id": "floor", "bsdf": {"type": "diffuse", "reflectance": checkers(scale=(5, 5))}}
     floor["to_world"] = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
     return scene(sensor=camera((3.6, 0.8, -4.0), (3.2, 0, -3.2)), floor=floor, sky=constant(0.6))

@@ -122,8 +122,8 @@ class FilmBoundary:
         stratified number. Where edges are curves on the film, angles from the eye stand for lengths.
 
         sampler : seeded for `count` lanes.
-        tracer : tells what is `seen` on both sides of the edge, with equal random numbers, so that an edge that is
-            hidden, or across which nothing jumps, contributes next to nothing rather than noise.
+        tracer : tells what is `seen` on both sides of the edge, with equal random numbers, so that an edge across which
+            nothing jumps contributes next to nothing rather than noise.
 
         Bias: the two sides are looked at a distance `_offset` from the edge; what changes on that scale is smeared by
         it, and folds of faces that are narrower on the film do not count.
@@ -227,8 +227,7 @@ class FilmBoundary:
     def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart.
 
-        Farther beside spheres, disks and cylinders, which rays meet less precisely. On fine meshes, silhouettes that
-        others hide by less than this count twice.
+        Farther beside spheres, disks and cylinders, which rays meet less precisely.
         """
         projection, ulp = at.projection, dr.epsilon(mi.Float) * 2
         ulps = dr.select(chosen.is_curve, 8, 2) * ulp if self.outlines.curves is not None else 2 * ulp

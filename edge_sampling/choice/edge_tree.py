@@ -15,15 +15,12 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import no_collection
-from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
+from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, DeviceEdges
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
 
 #: Edges of a leaf. They are tested one by one.
 LEAF = 8
-
-#: Planes whose signs are within this of zero, relative to the distance, count as edge-on.
-EDGE_ON = 1e-6
 
 
 @dataclass

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .edge_tree import EDGE_ON, Slot
+from rimlight.edge_sampling.geometry.device_edges import EDGE_ON
+
+from .edge_tree import Slot
 from .views import Cone, Lobe, View
 
 #: Added to the cosine of an edge, by whether a light looks: it stands for all of the edge, and the normal at a shading

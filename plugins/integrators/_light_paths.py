@@ -171,6 +171,7 @@ class LightPaths:
         choice: mi.Float | None = None,
         active: mi.Bool | bool = True,
         horizon: Horizon | None = None,
+        pi: mi.PreliminaryIntersection3f | None = None,
     ) -> None:
         """Trace paths, and hand the light at their vertices over. Call it with gradients suspended.
 
@@ -180,6 +181,7 @@ class LightPaths:
         scale : mi.Spectrum, (N,), what their radiance is multiplied by. Detached.
         choice : mi.Float, (N,), uniform; which lights are evaluated. None if all of them are.
         horizon : on which side of the horizon of interpolated normals the first vertices are; None: as they are.
+        pi : what the rays meet, if that is known.
         """
         scattering = LightByLight(self.scene, self.lights, self.per_path, attached=to.attached)
         area = scattering.any_hit_by_rays
@@ -187,7 +189,7 @@ class LightPaths:
         with dr.resume_grad(when=to.attached):
             ray = wide(mi.Ray3f(ray), dr.full(mi.Bool, True, dr.width(u)))
         ray = to.start(ray)
-        pi = self.tracer.first_hit(ray, active)
+        pi = self.tracer.first_hit(ray, active) if pi is None else pi
         one, zero = (dr.full(mi.Spectrum, value, dr.width(u)) for value in (1, 0))
         place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, horizon)
         if area and not self.tracer.hide_emitters:

@@ -209,10 +209,10 @@ class RigIntegrator(EdgeIntegrator):
             weight = dr.detach(weight)
         choice = self._choice(sampler, seed)
         to = Splat(layers) if forward else Measure(layers)
-        sides = zip((1, -1), points.rays, points.weights, points.horizons, strict=True)
-        for sign, ray, ray_weight, horizon in sides:
+        sides = zip((1, -1), points.rays, points.met, points.weights, points.horizons, strict=True)
+        for sign, ray, pi, ray_weight, horizon in sides:
             scale = ray_weight * (sign * weight)
-            paths.trace(to, sampler.clone(), ray, position, scale, choice, points.active, horizon)
+            paths.trace(to, sampler.clone(), ray, position, scale, choice, points.active, horizon, pi)
         if not forward:
             dr.eval(to.total, points.n_dl)
             with dr.resume_grad():

@@ -6,6 +6,7 @@ segment is bisected. How the jump moves follows from a function that vanishes th
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -40,7 +41,7 @@ LONGEST, SHORTEST = 1.0, 16
 HIDDEN, HALVINGS = 4, 7
 
 #: How far beside lines of textures to look, in units in the last place of the coordinates in which they are whole.
-BESIDE_TEXTURE = 256
+BESIDE_TEXTURE = 64
 
 #: What is looked for, in plans.
 WHAT = ("perfect mirrors or glass", "textures that jump")
@@ -183,8 +184,9 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
     """What is seen on both sides of a jump, a little farther aside than it is known.
 
     Close to the edges of mirrors and glass, and to lines in which surfaces cut each other, rays start beyond the other
-    surface. Close to a line of a texture, rounding may put both rays on the same side of it when the texture is
-    evaluated. This looks past that, unless other faces are there.
+    surface. Close to a line of a texture, few numbers are left in single precision, and often one of both rays meets
+    the line itself, which may belong to either side: to Mitsuba's `checkerboard`, to the other one. This looks past
+    that, unless other faces, or other parts of the texture, are there.
     """
     aside = dr.zeros(mi.Float, dr.width(at.found))
     if outline is not None:
@@ -202,8 +204,11 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
     other = chains.part((chains.first(wide.start, wanted), chains.first(wide.end, wanted)), wide, wanted, None)
     usable = wanted & other.found
     for v, w in ((at.a, other.a), (at.b, other.b)):
-        same_face = (v.pi.prim_index == w.pi.prim_index) | at.on_texture
-        usable &= (v.pi.shape == w.pi.shape) & same_face & (v.depth == w.depth)
+        same = v.pi.prim_index == w.pi.prim_index
+        if chains.textures is not None:
+            cells = (chains.textures.cell(chains.surfaces.met(x.ray, x.pi, wanted)) for x in (v, w))
+            same = dr.select(at.on_texture, operator.eq(*cells), same)
+        usable &= (v.pi.shape == w.pi.shape) & same & (v.depth == w.depth)
     a, b = (dr.select(usable, new, old) for new, old in ((other.a, at.a), (other.b, at.b)))
     return replace(at, a=a, b=b)
 

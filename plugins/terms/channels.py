@@ -56,7 +56,8 @@ class ChannelsOnFilmTerm(FilmTerm):
         points = job.boundaries.film.points(tracer, part.sensor, sampler, count)
         shown = [points.active & dr.any(weight != 0) for weight in points.weights]
         rays = [tracer.sized(ray) for ray in points.rays]
-        sides = [tracer.values(ray, on, attached=False) for ray, on in zip(rays, shown, strict=True)]
+        met = zip(rays, shown, points.met, strict=True)
+        sides = [tracer.values(ray, on, attached=False, pi=pi) for ray, on, pi in met]
         jumps = [first - second for first, second in zip(*sides, strict=True)]
         labels = [c.kind in LABELS for c in tracer.channels for _ in c.components]
         jumps = [mi.Float(0) if label else jump for jump, label in zip(jumps, labels, strict=True)]

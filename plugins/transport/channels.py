@@ -106,13 +106,21 @@ class ChannelTracer(PathTracer):
                 ray.scale_differential(self.footprint)
         return ray
 
-    def values(self, ray: mi.RayDifferential3f, active: mi.Bool, *, attached: bool) -> list[mi.Float]:
+    def values(
+        self,
+        ray: mi.RayDifferential3f,
+        active: mi.Bool,
+        *,
+        attached: bool,
+        pi: mi.PreliminaryIntersection3f | None = None,
+    ) -> list[mi.Float]:
         """One number for each component of each channel: mi.Float, (N,). Where no surface is seen they are 0.
 
         ray : of `sized`.
         attached : to the surface that a ray fixed on the film meets, and to the ray. Labels are never attached.
+        pi : what the rays meet, if that is known.
         """
-        pi = self.first_hit(ray, active)
+        pi = self.first_hit(ray, active) if pi is None else pi
         si = seen_by_camera(ray, pi, active, attached=attached)
         with dr.resume_grad(when=attached):
             valid = active & si.is_valid()
