@@ -55,18 +55,18 @@ class Geometry:
         meshes = tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
         return meshes + tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
 
-    def refuse_moving_others(self, params: mi.SceneParameters, who: str) -> None:
+    def refuse_moving_others(self, changing: dict[str, mi.Object], who: str) -> None:
         """Refuse derivatives with respect to shapes whose silhouettes are not known, inside of shape groups, too.
 
-        params : of the scene.
+        changing : the parameters of the scene that carry a gradient, and what each belongs to.
 
         Raises
         ------
         RuntimeError : one of `others`, or a shape in a group, carries a gradient in one of its own parameters.
         """
         known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
-        for key, (_, _, node, _) in params.properties.items():
-            if isinstance(node, mi.Shape) and int(node.ptr) not in known and dr.grad_enabled(params[key]):
+        for key, node in changing.items():
+            if isinstance(node, mi.Shape) and int(node.ptr) not in known:
                 raise RuntimeError(
                     f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{key}" carries a gradient), but its '
                     "silhouettes cannot be sampled: only triangle meshes, spheres, disks and cylinders outside of "

@@ -50,7 +50,8 @@ class BoundarySearch:
     from_points : does it have boundaries as shading points see them?
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("_boundaries",))  # for `dr.freeze`
+    #: Nothing, for `dr.freeze`: what a frozen function depends on is what `find_boundaries` returns to it.
+    DRJIT_STRUCT = dict.fromkeys(())
 
     def __init__(self, who: str, depths: Depths, *, planes: bool, from_points: bool):
         self.who, self.depths, self.planes, self.from_points = who, depths, planes, from_points
@@ -81,8 +82,9 @@ class BoundarySearch:
         with dr.resume_grad():
             self._media.refuse_gradients(self.who)
             limits = (*self._media.limits(), *self._partial.limits())
-            geometry.refuse_moving_others(params, self.who)
-            moving = self._what_moves(scene, sensor, geometry)
+            changing = _changing(params)
+            geometry.refuse_moving_others(changing, self.who)
+            moving = self._what_moves(scene, sensor, geometry, changing)
         if not moving.anything:
             return Boundaries(limits=limits)
         if not dr.flag(dr.JitFlag.FreezingScope):
@@ -143,9 +145,12 @@ class BoundarySearch:
 
     # ---------------------- What moves ----------------------
 
-    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry) -> Moving:
+    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry, changing: dict) -> Moving:
         moves = geometry.moving()
-        camera = any(dr.grad_enabled(value) for _, value in mi.traverse(sensor).items())
+        # To traverse takes long in a step of milliseconds: not where shapes alone change.
+        only_shapes = all(isinstance(o, mi.Shape) for o in changing.values())
+        still = only_shapes and any(s is sensor for s in scene.sensors())
+        camera = not still and any(dr.grad_enabled(value) for _, value in mi.traverse(sensor).items())
         if camera and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
             raise RuntimeError(
@@ -154,7 +159,8 @@ class BoundarySearch:
             )
         shapes = (*geometry.meshes, *geometry.analytic)
         lamps = any(s.is_emitter() and m for s, m in zip(shapes, moves, strict=True))
-        others = [mi.traverse(e) for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
+        others = [] if only_shapes else [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
+        others = [mi.traverse(e) for e in others]
         lights = lamps or any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
         mapped = tuple(dict.fromkeys(m.shape for m in self._maps if m.turns))
         return Moving(shapes, moves, camera, lights, mapped)
@@ -215,3 +221,11 @@ class BoundarySearch:
             # With the sensor, so that its number is given to no other one.
             self._beyond[key] = sensor, beyond_far_plane(sensor, list(moving.on_film))
         return self._beyond[key][1] if key in self._beyond else []
+
+
+def _changing(params: mi.SceneParameters) -> dict[str, mi.Object]:
+    """The parameters that carry a gradient now, and what each belongs to."""
+    # Not by `params[key]`, which also remembers every value, and takes three times as long.
+    value = lambda it, kind, node: it if kind is None else params.get_property(it, kind, node)
+    found = params.properties.items()
+    return {key: node for key, (it, kind, node, _) in found if dr.grad_enabled(value(it, kind, node))}
