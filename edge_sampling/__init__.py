@@ -16,7 +16,7 @@ from .geometry.meshes import Geometry, objects_below
 from .geometry.sources import Sources
 from .geometry.t_junctions import t_junctions
 from .geometry.texture_lines import TextureLines, jumping_textures
-from .lights import Lights, has_hard_beam
+from .lights import Lights
 from .projection.film_parts import Batch, FilmPart, film_parts
 from .projection.sensors import Projection
 from .smooth_lamps import SmoothLamps
@@ -52,7 +52,6 @@ __all__ = [
     "film_parts",
     "find_edges",
     "find_welded_edges",
-    "has_hard_beam",
     "jumping_textures",
     "objects_below",
     "resample",

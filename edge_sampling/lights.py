@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 
 class Lights:
@@ -95,16 +94,3 @@ def _runs(runs: list[tuple[int, int, int]]) -> mi.UInt32:
 
 def _may_be_delta(emitter: mi.Emitter) -> bool:
     return bool(emitter.flags() & mi.EmitterFlags.Delta) or hasattr(emitter, "light_count")
-
-
-def has_hard_beam(emitter: mi.Emitter) -> bool:
-    """Does what a `spot` or a `projector` throws end with a jump?"""
-    params = mi.traverse(emitter)
-    if emitter.class_name() == "SpotLight":
-        return bool(dr.any(params["beam_width"] >= params["cutoff_angle"]))
-    if emitter.class_name() == "Projector":
-        if "irradiance.data" not in params:
-            return True
-        image = np.array(dr.detach(params["irradiance.data"]))
-        return bool(max(np.abs(side).max() for side in (image[0], image[-1], image[:, 0], image[:, -1])) > 0)
-    return False

@@ -13,6 +13,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from beams import BEAMS
 from building import (
     CUBE_FACES,
     RES,
@@ -895,7 +896,7 @@ CASES = [
     Case("box_behind_glass", box_behind_glass, BOX_ALONG, 1e-2, spp=256, runs=24, integrator=prb_edge(3)),
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096)
-        for k, (*of, depth) in (CUTS | MIRRORS).items()
+        for k, (*of, depth) in (CUTS | MIRRORS | BEAMS).items()
     ),
 ]
 

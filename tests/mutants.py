@@ -254,6 +254,12 @@ MUTANTS = [
         "aside = dr.select(at.on_texture, BESIDE_TEXTURE",
         "aside = dr.select(at.on_texture, 0 * BESIDE_TEXTURE",
     ),
+    mutant(
+        "lines of textures: the border of a projector's picture stands still when its light turns",
+        "edge_sampling/geometry/beams.py",
+        "return emitter.sample_direction(si, mi.Point2f(0))[0].uv",
+        "return dr.detach(emitter.sample_direction(si, mi.Point2f(0))[0].uv)",
+    ),
     # ---------------------- Chains ----------------------
     mutant(
         "shadows in indirect light: 2 % too large",

@@ -212,7 +212,8 @@ class ShadowBoundary:
         # From x to the edge, nothing is in the way: that has been seen already.
         onwards = shadow.onwards
         onwards.wavelengths = view.ray.wavelengths
-        distance = dr.norm(y - onwards.o)
+        # As far as rays from x go (`spawn_ray_to`), since lights may lie on surfaces.
+        distance = dr.norm(y - onwards.o) - mi.math.ShadowEpsilon * dr.norm(y - si.p)
         onwards.maxt = dr.select(on_surface | light.far, dr.largest(mi.Float), distance)
         met = scene.ray_intersect_preliminary(onwards, active=view.active)
         reached = met.is_valid() & (met.shape.emitter() == light.emitter)

@@ -41,9 +41,7 @@ class MappedHorizon:
         if self.two_sided:
             wi.z = dr.abs(wi.z)
         n = self._from_heights(si) if _has_heights(self.bsdf) else 2 * mi.Vector3f(self.texture.eval_3(si)) - 1
-        facing = dr.dot(wi, n)
-        # Between -1 and 1, so that it is whole at 0 only.
-        return mi.Vector2f(facing / (1 + dr.abs(facing)), 0.5)
+        return whole_at_zero(dr.dot(wi, n))
 
     def _from_heights(self, si: mi.SurfaceInteraction3f) -> mi.Vector3f:
         """As Mitsuba's `bumpmap` makes it: in the frame of shading."""
@@ -53,6 +51,11 @@ class MappedHorizon:
         along_v = si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv))
         bumped = dr.cross(along_u, along_v)
         return si.to_local(bumped * dr.sign(dr.detach(dr.dot(si.n, bumped))))
+
+
+def whole_at_zero(x: mi.Float) -> mi.Vector2f:
+    """A number with the sign of x between -1 and 1, and 0.5: where x is 0, and only there, one of them is whole."""
+    return mi.Vector2f(x / (1 + dr.abs(x)), 0.5)
 
 
 def mapped_horizons(shape: Any) -> list[MappedHorizon]:

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .beams import BEAMS, border_values, has_hard_beam
 from .edges import Edges, Weld
 from .meshes import Geometry, bent_faces, has_interpolated_normals, is_smooth, vertex_attributes
 
@@ -54,6 +55,8 @@ class Sources:
             if i in self._seams and name not in ("faces", "positions", "normals")
         }
         dr.eval(self._differing)
+        #: Lights whose beams may end with a jump: what that depends on, and whether they do.
+        self._beams = {e: (border_values(e), has_hard_beam(e)) for e in scene.emitters() if e.class_name() in BEAMS}
         #: Vertices at different places, and pairs at the same place.
         first, place = weld.first, weld.place
         self._first = _index(first)
@@ -81,6 +84,8 @@ class Sources:
         Reads one bit from the device, or nothing if no array was replaced. (Where one was, Mitsuba has just waited for
         the device, to find the bounding box.) Not in frozen functions.
         """
+        if not self._same_beams():
+            return False
         new = self._arrays(geometry)
         replaced = [key for key, array in new.items() if array.index != self._held[key].index]
         if not replaced:
@@ -100,6 +105,16 @@ class Sources:
         if changed[0]:
             return False
         self._held = new
+        return True
+
+    def _same_beams(self) -> bool:
+        """Do the beams end with jumps that did so? Looks at images that were replaced."""
+        for emitter, (held, hard) in self._beams.items():
+            values = border_values(emitter)
+            if any(v.index != h.index for v, h in zip(values, held, strict=True)):
+                if has_hard_beam(emitter) != hard:
+                    return False
+                self._beams[emitter] = values, hard
         return True
 
     def _arrays(self, geometry: Geometry) -> dict[tuple[int, str], Any]:

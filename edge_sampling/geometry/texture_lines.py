@@ -1,5 +1,5 @@
 """Lines at which textures jump: checkerboards, bitmaps with the `nearest` filter, the slopes of bump maps; and those
-along which mapped normals turn away from the viewer.
+along which mapped normals turn away from the viewer; and those at which the light of spots and projectors jumps.
 
 Each of them is where a function of a point on the surface is whole. Textures jump at the lines of a lattice: where a
 component of A·(u, v, 1) is whole, with a matrix A of its own.
@@ -15,26 +15,35 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
 from .mapped_horizons import mapped_horizons
 from .meshes import Geometry, has_place, objects_below, texture_coordinates
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where one texture of a shape jumps. matrix : A, (2, 3)."""
+    """Where one texture jumps.
 
-    shape: Any
+    matrix : A, (2, 3).
+    light : whose texture it is; None: it is one of a shape.
+    """
+
     matrix: np.ndarray
+    light: mi.Emitter | None = None
 
     @property
     def size(self) -> float:
-        """Largest coordinate in it of texture coordinates up to 1."""
-        return float(np.abs(self.matrix).sum(1).max())
+        """Largest coordinate in it of texture coordinates up to 1, or what stands for it, by which it is rounded."""
+        return float(np.abs(self.matrix).sum(1).max()) * (1.0 if self.light is None else ROUNDING)
 
     def at(self, si: mi.SurfaceInteraction3f) -> mi.Vector2f:
-        """Place in the lattice; attached, if the texture coordinates are."""
+        """Place in the lattice; attached, if the texture coordinates are. Outside of beams the same everywhere."""
         (a, b, c), (d, e, f) = self.matrix.tolist()
-        return mi.Vector2f(a * si.uv.x + b * si.uv.y + c, d * si.uv.x + e * si.uv.y + f)
+        uv = si.uv if self.light is None else on_texture(self.light, si)
+        if self.light is not None:
+            inside = dr.all((uv >= 0) & (uv <= 1))
+            uv = dr.select(inside, dr.minimum(uv, dr.one_minus_epsilon(mi.Float)), 0.5)
+        return mi.Vector2f(a * uv.x + b * uv.y + c, d * uv.x + e * uv.y + f)
 
 
 @dataclass(frozen=True)
@@ -51,21 +60,26 @@ class Line:
 class TextureLines:
     """The lines on shapes.
 
-    shapes : those that count.
+    shapes : those whose own lines count.
+    lights : those whose lines count.
+    lit : shapes on which these count; None: on all.
     """
 
     DRJIT_STRUCT = dict.fromkeys(("_sizes",))  # for `dr.freeze`
 
-    def __init__(self, shapes: Sequence[Any]):
+    def __init__(self, shapes: Sequence[Any], lights: Sequence[mi.Emitter] = (), lit: Sequence[Any] | None = None):
         # Of each shape, lattices last, since the last line counts where several are found: the slopes of bump maps jump
         # there, and so may whether they turn away.
-        of_shapes = [(s, [*mapped_horizons(s), *(Lattice(s, m) for m in _matrices(s))]) for s in shapes]
-        self.kinds = [kind for _, kinds in of_shapes for kind in kinds]
+        of_shapes = [(s, [*mapped_horizons(s), *(Lattice(m) for m in _matrices(s))]) for s in shapes]
+        # The border of a beam counts where the texture of the light jumps as well.
+        of_lights = [kind for light in lights for kind in _of_beam(light)]
+        self.kinds = [kind for _, kinds in of_shapes for kind in kinds] + of_lights
         #: The largest value of each function where the texture coordinates are at most 1.
         self._sizes = mi.Float([k.size for k in self.kinds] or [1])
         numbers = iter(range(len(self.kinds)))
         #: Shapes, and the numbers of their functions.
         self._shapes = [(s, [next(numbers) for _ in kinds]) for s, kinds in of_shapes if kinds]
+        self._of_lights, self._lit = list(numbers), lit
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -78,6 +92,10 @@ class TextureLines:
             cell = mi.sample_tea_32(found ^ mi.UInt32(at.x), mi.UInt32(at.y))[0]
             found = dr.select(there, cell, found)
         return found
+
+    def has_own(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Does the shape of a point have lines of its own?"""
+        return _is_one_of(si, [shape for shape, _ in self._shapes])
 
     def between(self, a: mi.SurfaceInteraction3f, b: mi.SurfaceInteraction3f) -> Line:
         """The line between two points of a surface that are next to each other."""
@@ -99,23 +117,38 @@ class TextureLines:
         return dr.epsilon(mi.Float) * dr.maximum(size, dr.abs(dr.detach(self.across(line, si))))
 
     def _of(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.UInt32, mi.Bool]]:
-        """The functions of the shape of a point, one after the other: their numbers, and whether it has so many."""
-        for k in range(max(len(numbers) for _, numbers in self._shapes)):
+        """The functions of a point, one after the other: their numbers, and whether its shape has so many."""
+        for k in range(max((len(numbers) for _, numbers in self._shapes), default=0)):
             which, there = mi.UInt32(0), mi.Bool(False)
             for shape, numbers in self._shapes:
                 if k < len(numbers):
                     mine = si.shape == mi.ShapePtr(shape)
                     which, there = dr.select(mine, numbers[k], which), there | mine
             yield which, there
+        for number in self._of_lights:
+            yield mi.UInt32(number), si.is_valid() if self._lit is None else _is_one_of(si, self._lit)
 
     def _at(self, which: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool | bool) -> mi.Vector2f:
         """The value of one function. As calls, since a scene may have many maps, each of them with a texture."""
         return dr.switch(which, [lambda si, active, kind=kind: kind.at(si) for kind in self.kinds], si, mi.Bool(active))
 
 
+def _is_one_of(si: mi.SurfaceInteraction3f, shapes: Sequence[Any]) -> mi.Bool:
+    found = mi.Bool(False)
+    for shape in shapes:
+        found |= si.shape == mi.ShapePtr(shape)
+    return found
+
+
+def _of_beam(light: mi.Emitter) -> list[Any]:
+    """Where the light of a spot or a projector jumps."""
+    border = [BeamBorder(light)] if has_hard_beam(light) else []
+    return [*(Lattice(m, light) for m in _matrices(light)), *border] if light.class_name() in BEAMS else []
+
+
 def _matrices(shape: Any) -> list[np.ndarray]:
-    """Of the textures of a shape that jump."""
-    of_mesh = shape.is_mesh() and shape.has_vertex_texcoords()
+    """Of the textures of a shape, or of a light, that jump."""
+    of_mesh = isinstance(shape, mi.Mesh) and shape.has_vertex_texcoords()
     uv = np.concatenate([[[0, 0], [1, 1]], texture_coordinates(shape) if of_mesh else np.zeros((0, 2))])
     found = []
     below = objects_below(shape)

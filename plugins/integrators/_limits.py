@@ -14,12 +14,12 @@ from rimlight.edge_sampling import (
     Edges,
     Geometry,
     film_parts,
-    has_hard_beam,
     jumping_textures,
     objects_below,
     t_junctions,
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
+from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.cut_curves import cut_curves
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, vertices
 from rimlight.edge_sampling.rays import extent
@@ -105,10 +105,11 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             'environment and all that edges do to indirect light; set "sppi" to 0 to accept this.'
         )
     beams = names(e for e in scene.emitters() if has_hard_beam(e))
-    if beams:
+    if beams and (depths.scatters(2) or not from_points):
         limits.append(
-            f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below "
-            "its cutoff_angle, and a projector an image with a black border."
+            f"the derivative lacks{', in indirect light,' if from_points else ''} the border of the beams of "
+            f"{', '.join(beams)}: give a spot a beam_width below its cutoff_angle, and a projector an image with a "
+            "black border."
         )
     if any(is_mirror(s) for s in scene.shapes()) and (depths.scatters(2) or not from_points):
         lacks = "outlines in the light that perfect mirrors and glass throw on other surfaces"
@@ -135,7 +136,15 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
 def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool) -> list[str]:
     """What lacks of the jumps inside of surfaces and environments. bisects : are the lines of textures found?"""
     limits = []
-    textures = jumping_textures(scene, besides=scene.shapes() if bisects else ())
+    beams = [e for e in scene.emitters() if e.class_name() in BEAMS] if bisects else []
+    textures = jumping_textures(scene, besides=(*scene.shapes(), *beams) if bisects else ())
+    thrown = jumping_textures(scene, besides=scene.shapes()) if beams and depths.scatters(2) else []
+    thrown = [name for name in thrown if name not in textures]
+    if thrown:
+        limits.append(
+            f"the derivative lacks, in indirect light, the jumps of the textures {', '.join(thrown)}; use bilinear "
+            "bitmaps."
+        )
     if textures:
         limits.append(
             f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "

@@ -34,8 +34,8 @@ from rimlight.transport.paths import Depths
 
 from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits
 
-#: Parameters of a light that move the shadows in it.
-PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction")
+#: Parameters of a light that move the shadows in it, or the border of its beam.
+PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction", "cutoff_angle")
 
 
 class BoundarySearch:
@@ -184,11 +184,18 @@ class BoundarySearch:
         what = moving.flags, moving.camera, moving.lights
         mirrors = [s for s in scene.shapes() if is_mirror(s)] if self.from_points and self.depths.scatters(1) else []
         mirrors = bool(mirrors), FineMirrors(mirrors) if mirrors else None
-        textures = TextureLines(scene.shapes() if mirrors[0] else moving.with_lines) if self.from_points else ()
-        textures = textures if len(textures) else None
+        textures = self._texture_lines(scene, moving, mirrors[0]) if self.from_points else None
         chains = (*mirrors, textures, Surfaces(scene) if mirrors[0] or textures else None)
         lights = LightChoice.of(scene)
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights)
+
+    @staticmethod
+    def _texture_lines(scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
+        """The lines of textures, and of what lights throw, that move as seen from the camera, or in mirrors."""
+        shapes = scene.shapes() if mirrors else moving.with_lines
+        everywhere = mirrors or moving.camera or moving.lights
+        lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes)
+        return lines if len(lines) else None
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int

@@ -43,10 +43,9 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     boundary unless something occludes it.
 
     **Limits.** Only triangle meshes, spheres, disks and cylinders can move: a moving hair, instance, ... is refused,
-    and so is a camera that moves past one. Missing, with a warning: the jumps of textures (``checkerboard``,
-    ``nearest`` filters) of lamps, environments and projectors, the curves in which spheres, disks and cylinders cut
-    through other shapes, or the far clipping plane through any, the borders of hard beams, and shadows of hair,
-    instances, ... on what moves. Warned about, too: jumps at T-junctions, which count twice, and participating
+    and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and
+    cylinders cut through other shapes, or the far clipping plane through any, and shadows of hair, instances, ... on
+    what moves. Warned about, too: jumps at T-junctions, which count twice, and participating
     media, which are taken for empty (derivatives with respect to their parameters are refused). So is the light of
     smooth-shaded lamps with coarse meshes, which is off by some per cent. Polarised variants are refused. With
     filters other than ``box``, the ratio of sums that makes a pixel has a bias of order 1/spp, as it has in the

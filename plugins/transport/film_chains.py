@@ -296,7 +296,7 @@ class Chains:
             dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
         )
         cells = dr.select(met, self.textures.cell(si), 0) if self.textures is not None else mi.UInt32(0)
-        textured = met & (cells != 0)  # if there are lines on the shape
+        textured = met & self.textures.has_own(si) if self.textures is not None else mi.Bool(False)
         seen = Seen(
             dr.select(met, _shape_of(pi), 0),
             cells,

@@ -263,7 +263,7 @@ def warnings_of(scene, key, options, **motion) -> str:
         it = integrator(**options)
         for _ in range(2):
             derivative_image(scene, it, Motion(scene, key, **motion), spp=1)
-    return "\n".join(m for m in found if "_edge: " in m)
+    return "\n".join(m for m in found if "_edge: " in m or "rig: " in m)
 
 
 def test_limits_are_warned_about_once():
@@ -272,13 +272,14 @@ def test_limits_are_warned_about_once():
         "to_world": mi.ScalarTransform4f().look_at([0, 4, -3], [0, 0, 0], [0, 1, 0]),
         "irradiance": {"type": "checkerboard"},
     }
-    scene = cases.cube(lamp=projector)()
-    text = warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
-    for part in ("border of the beams", "jumps of the textures"):
+    scene, deep = cases.cube(lamp=projector)(), {"type": "prb_edge", "max_depth": 3}
+    text = warnings_of(scene, "cube.vertex_positions", deep, direction=[1, 0, 0])
+    for part in ("lacks, in indirect light, the border of the beams", "lacks, in indirect light, the jumps of the"):
         assert text.count(part) == 1
     assert "hard shadows" not in text
-    quiet = warnings_of(scene, "cube.vertex_positions", {"sppi": 0}, direction=[1, 0, 0])
+    quiet = warnings_of(scene, "cube.vertex_positions", {**deep, "sppi": 0}, direction=[1, 0, 0])
     assert "border of the beams" not in quiet
+    assert not warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
 
 
 def test_normal_maps_are_warned_about_in_indirect_light_only():
@@ -300,10 +301,11 @@ def test_normal_maps_are_warned_about_in_indirect_light_only():
         ({"type": "projector", "irradiance": {"type": "rgb", "value": 1.0}}, True),
     ],
 )
-def test_borders_of_beams_are_warned_about(lamp, hard):
-    scene = cases.cube(lamp=lambda: lamp)()
-    text = warnings_of(scene, "cube.vertex_positions", {}, direction=[1, 0, 0])
-    assert ('the border of the beams of "lamp"' in text) == hard
+def test_borders_of_beams_are_warned_about_in_indirect_light_only(lamp, hard):
+    scene, border = cases.cube(lamp=lambda: lamp)(), 'the border of the beams of "lamp"'
+    for options, warned in (({}, False), ({"type": "prb_edge", "max_depth": 3}, hard), ({"type": "rig"}, hard)):
+        text = warnings_of(scene, "cube.vertex_positions", options, direction=[1, 0, 0])
+        assert (border in text) == warned
 
 
 def test_a_scene_that_does_not_move_is_a_mistake():

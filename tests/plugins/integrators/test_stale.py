@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 
+import beams
 import cases
 import drjit as dr
 import mirrors
@@ -178,6 +179,23 @@ def test_material_is_exchanged(make):
     derivative(scene, used, key)
     floor.set_bsdf(glossy)
     assert_as_fresh(scene, used, make, key)
+
+
+def test_a_beam_that_comes_to_end_with_a_jump(make):
+    """The border of a projector's picture is black at first, then white; a spot comes to have no falloff."""
+    black, white = np.zeros((4, 4, 3), np.float32), np.ones((4, 4, 3), np.float32)
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(black), "raw": True, "wrap_mode": "clamp"}
+    picture = {"type": "projector", "to_world": beams.at(), "irradiance": bitmap, "fov": 25.0}
+    for lamp, key, value in (
+        (picture, "lamp.irradiance.data", mi.TensorXf(white)),
+        ({**beams.hard_spot(), "beam_width": 4.0}, "lamp.beam_width", mi.Float(18.0)),
+    ):
+        scene, used = beams.on_cube(lambda lamp=lamp: lamp)(), make()
+        derivative(scene, used, "sensor.to_world")
+        params = mi.traverse(scene)
+        params[key] = value
+        params.update()
+        assert_as_fresh(scene, used, make, "sensor.to_world")
 
 
 # ---------------------- Several scenes ----------------------
