@@ -55,6 +55,7 @@ SQUARE, LARGEST = 5, 5.5
 SPECIAL = {
     "cut": "meshes stand in the floor, and in each other; none of them is a lamp",
     "jumps": "all that things have are perfect mirrors, smooth glass, and textures that jump",
+    "beams": "spots and projectors light them, whose beams end with a jump, in direct light",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 
@@ -184,7 +185,7 @@ class Generator:
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
-        direct = direct if self.special != "jumps" else not self.glows
+        direct = {"jumps": not self.glows, "beams": True}.get(self.special, direct)
         self.depth = depth = 2 if direct else int(self.rng.integers(2, 6))
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
@@ -463,6 +464,8 @@ class Generator:
     def make_light(self, i: int, before: list[str]) -> str:
         name = f"light{i}"
         kinds = ("area", "ball", "disklight", "meshball", "point", "spot", "sun", "sky", "environment")
+        if self.special == "beams":
+            kinds = ("spot", "projector")
         kind = self.pick(*kinds)
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
@@ -503,6 +506,21 @@ class Generator:
                 "intensity": grey(25 * power * self.scale**2),
                 "cutoff_angle": 40,
                 "beam_width": 25,
+            }
+            if self.special == "beams":
+                made["cutoff_angle"] = self.uniform(10, 30)
+                made["beam_width"] = made["cutoff_angle"] + 1
+                if self.chance(0.5):
+                    made["texture"] = {**self.bitmap(4, 5), "filter_type": self.pick("nearest", "bilinear")}
+            moves += [(f"{name}.to_world", "pose", centre)]
+        elif kind == "projector":
+            picture = {**self.bitmap(4, 5), "filter_type": self.pick("nearest", "bilinear")}
+            made = {
+                "type": "projector",
+                "to_world": self.look(centre, [0, 0.4, 0], [0, 0, 1]),
+                "irradiance": self.pick(picture, {"type": "rgb", "value": [1, 0.7, 0.4]}),
+                "fov": self.uniform(20, 50),
+                "scale": 4 * power * self.scale**2,
             }
             moves += [(f"{name}.to_world", "pose", centre)]
         elif kind == "sun":
