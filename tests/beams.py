@@ -65,6 +65,14 @@ def in_mirror() -> mi.Scene:
     return scene(sensor=camera((0.3, 1.5, -4)), floor=floor, mirror=mirror, lamp=white())
 
 
+def on_large_floor() -> mi.Scene:
+    """A beam on a sheet of 2,000 units, on which places are rounded to 6e-5 units, as Mitsuba's tests have it."""
+    at = mi.ScalarTransform4f().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0])
+    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(1000), "bsdf": diffuse(1.0)}
+    lamp = {"type": "projector", "to_world": at, "irradiance": {"type": "rgb", "value": 1.0}, "fov": 165.0}
+    return scene(sensor=camera((0, 0, 1), fov=170), sheet=sheet, lamp=lamp)
+
+
 SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0.4]}
 FLOOR = {"key": "floor.vertex_positions", "direction": [0, 1, 0]}
 LAMP = {"key": "lamp.to_world", "rotate": [0.3, 0.2, 1]}
@@ -82,5 +90,6 @@ BEAMS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "picture_turns": (on_cube(picture), LAMP, 1e-3, 2),
     "picture_of_spot": (on_cube(soft_spot_with_picture), FLOOR, 2e-3, 2),
     "lamp_with_picture": (on_cube(lamp_with_picture), LAMP_ALONG, 3e-3, 2),
+    "beam_on_large_floor": (on_large_floor, {"key": "sensor.to_world", "direction": [1, 0, 0]}, 3e-2, 2),
     "beam_in_mirror": (in_mirror, LAMP_ALONG, 2e-3, 3),
 }

@@ -40,6 +40,9 @@ LONGEST, SHORTEST = 1.0, 16
 #: most before. All numbers are equally likely: near corners, the variance is the sum of their reciprocal probabilities.
 HIDDEN, HALVINGS = 4, 7
 
+#: Where nothing is found to jump in it after all, it is looked at once more, so many times as long.
+WIDE = 16
+
 #: How far beside lines of textures to look, in units in the last place of the coordinates in which they are whole.
 BESIDE_TEXTURE = 64
 
@@ -102,7 +105,11 @@ class BisectionTerm(Term):
         first = chains.first(segment.start, active), chains.first(segment.end, active)
         follow = lambda log: chains.part(first, segment, active, log)
         if not job.boundaries.mirrors:
-            return follow(None), None
+            at, wide = follow(None), segment.widened(0.5 * (WIDE - 1) * segment.length)
+            # On large shapes, places so close to each other may be one and the same, but for rounding.
+            lost = active & ~at.found
+            again = chains.part((chains.first(wide.start, lost), chains.first(wide.end, lost)), wide, lost, None)
+            return dr.select(lost, again, at), None
         log, at = written(job.tracer.scene, first[0].ray, 1, job.tracer.depths, follow, lambda at: at.a.depth)
         chain = Chain(job.tracer.scene, Vicinity.of(first[0].pi))
         behind = at.found & (at.a.depth > 1)
@@ -200,7 +207,7 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
         aside = dr.select(at.on_texture, BESIDE_TEXTURE * chains.textures.rounding(line, si) / dr.abs(along), aside)
     wanted = at.found & (aside > 0) & (aside < LONGEST)
     aside = dr.select(wanted, aside, 0)
-    wide = replace(segment, start=segment.start - aside * segment.axis, length=segment.length + 2 * aside)
+    wide = segment.widened(aside)
     other = chains.part((chains.first(wide.start, wanted), chains.first(wide.end, wanted)), wide, wanted, None)
     usable = wanted & other.found
     for v, w in ((at.a, other.a), (at.b, other.b)):

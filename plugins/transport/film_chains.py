@@ -8,7 +8,7 @@ segment is bisected (`terms/mirrors.py`). Here chains are followed, and two of t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -185,6 +185,10 @@ class Segment:
     @property
     def middle(self) -> mi.Point2f:
         return self.start + 0.5 * self.length * self.axis
+
+    def widened(self, aside: mi.Float) -> Segment:
+        """Longer by so many pixels at both ends."""
+        return replace(self, start=self.start - aside * self.axis, length=self.length + 2 * aside)
 
     def half(self, middle: Seen, sampler: mi.Sampler) -> Segment:
         """One of its halves in which something jumps: any of two, with twice the weight."""
