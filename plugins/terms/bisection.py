@@ -47,7 +47,7 @@ WIDE = 16
 BESIDE_TEXTURE = 64
 
 #: What is looked for, in plans.
-WHAT = ("perfect mirrors or glass", "textures that jump")
+WHAT = ("perfect mirrors or glass", "textures or beams that jump")
 
 #: Most rays that one sample traces besides those of a path: for plans.
 RAYS = 2 * (3 * CANDIDATES + 11)
@@ -61,7 +61,7 @@ class BisectionTerm(Term):
     def planned(self, job: Job) -> PlannedTerm:
         count = sum(job.counts.on_line(part.sensor.film()) for part in job.parts) if self._wanted(job) else 0
         what = [w for w, there in zip(WHAT, (job.boundaries.mirrors, job.boundaries.textures), strict=True) if there]
-        why_not = '"sppp" is 0' if what else "neither mirrors, glass nor textures with jumps, or nothing moves"
+        why_not = '"sppp" is 0' if what else "neither mirrors, glass, textures nor beams with jumps, or nothing moves"
         return self.plan(count, RAYS + 2 * job.rays_of_path, " and ".join(what), why_not)
 
     def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import beams
 import cases
 import drjit as dr
 import mitsuba as mi
@@ -31,6 +32,8 @@ VALUES = [
     ("cube", "cube.vertex_positions"),  # with normals, under a sky: no light has a surface
     ("spot", "cube.vertex_positions"),
     ("spot", "lamp.to_world"),
+    ("picture", "lamp.to_world"),
+    ("picture", "sensor.to_world"),
     ("sphere", "thing.to_world"),
     ("torus", "torus.vertex_positions"),
 ]
@@ -39,6 +42,7 @@ SCENES = {
     "room": cases.room(),
     "cube": cases.cube(),
     "spot": cases.hard_shadow(lambda: {**cases.spot(), "intensity": 100.0}),
+    "picture": beams.on_cube(lambda: {**beams.picture(), "scale": 100.0}),
     "sphere": cases.sphere_over(cases.sun, cases.ceiling_light),
     "torus": cases.torus_in_the_sun,
     "fisheye": cases.room(cases.fisheye),
