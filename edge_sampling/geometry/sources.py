@@ -2,8 +2,9 @@
 
 Edges are found on the host, which takes seconds for a million of them; an optimisation step takes milliseconds. So they
 are kept as long as what they were derived from stays as it was: which shapes, materials and lights there are, their
-faces, which vertices lie at the same place, and where attributes differ between those. Vertices may move, as long as
-none of them part, and none meet, and the vertex normals of flat faces stay theirs.
+faces, which vertices lie at the same place, and where attributes differ between those; which beams end with a jump, and
+which textures are even. Vertices may move, as long as none of them part, and none meet, and the vertex normals of flat
+faces stay theirs.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 
 from .beams import BEAMS, border_values, has_hard_beam
 from .edges import Edges, Weld
-from .meshes import Geometry, bent_faces, has_interpolated_normals, is_smooth, vertex_attributes
+from .meshes import Geometry, bent_faces, has_interpolated_normals, has_place, is_smooth, vertex_attributes
+from .texture_lines import is_even, texture_values
 
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
 APART = 64
@@ -55,8 +57,10 @@ class Sources:
             if i in self._seams and name not in ("faces", "positions", "normals")
         }
         dr.eval(self._differing)
-        #: Lights whose beams may end with a jump: what that depends on, and whether they do.
-        self._beams = {e: (border_values(e), has_hard_beam(e)) for e in scene.emitters() if e.class_name() in BEAMS}
+        #: Lights and textures: by which arrays, and by which question, it is told whether something jumps.
+        self._pictures = {e: (border_values, has_hard_beam) for e in scene.emitters() if e.class_name() in BEAMS}
+        self._pictures |= {o: (texture_values, is_even) for o in params.hierarchy if has_place(o) and is_even(o)}
+        self._answers = {o: (values(o), answer(o)) for o, (values, answer) in self._pictures.items()}
         #: Vertices at different places, and pairs at the same place.
         first, place = weld.first, weld.place
         self._first = _index(first)
@@ -84,7 +88,7 @@ class Sources:
         Reads one bit from the device, or nothing if no array was replaced. (Where one was, Mitsuba has just waited for
         the device, to find the bounding box.) Not in frozen functions.
         """
-        if not self._same_beams():
+        if not self._same_pictures():
             return False
         new = self._arrays(geometry)
         replaced = [key for key, array in new.items() if array.index != self._held[key].index]
@@ -107,14 +111,15 @@ class Sources:
         self._held = new
         return True
 
-    def _same_beams(self) -> bool:
-        """Do the beams end with jumps that did so? Looks at images that were replaced."""
-        for emitter, (held, hard) in self._beams.items():
-            values = border_values(emitter)
-            if any(v.index != h.index for v, h in zip(values, held, strict=True)):
-                if has_hard_beam(emitter) != hard:
+    def _same_pictures(self) -> bool:
+        """Do those beams end with a jump that did so, and are textures even that were? Looks at what was replaced."""
+        for o, (held, before) in self._answers.items():
+            values, answer = self._pictures[o]
+            new = values(o)
+            if any(v.index != h.index for v, h in zip(new, held, strict=True)):
+                if answer(o) != before:
                     return False
-                self._beams[emitter] = values, hard
+                self._answers[o] = new, before
         return True
 
     def _arrays(self, geometry: Geometry) -> dict[tuple[int, str], Any]:

@@ -186,14 +186,32 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
     ]
 
 
+def texture_values(texture: mi.Texture) -> list[Any]:
+    """Texels, or colours: arrays, detached."""
+    return [dr.detach(v).array for v in _colours(texture)]
+
+
+def is_even(texture: mi.Texture) -> bool:
+    """Does a texture have the same value everywhere, as it is now? Then it does not jump, but it may come to do so."""
+    colours = [np.array(dr.detach(v)) for v in _colours(texture)]
+    rows = [v.reshape(-1, v.shape[-1] if v.ndim == 3 else v.size) for v in colours]
+    return all(r.shape[1] == rows[0].shape[1] and (r == rows[0][0]).all() for r in rows)
+
+
+def _colours(texture: mi.Texture) -> list[Any]:
+    return [v for key, v in mi.traverse(texture).items() if key.endswith(("data", "value"))]
+
+
 def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 256, steps: int = 22) -> bool:
-    """Bisect random segments towards their steeper half: where a texture is continuous, the difference dies out.
+    """Bisect segments towards their steeper half: where a texture is continuous, the difference dies out. They are
+    random, and that between the brightest texel and the darkest, since few may differ from all others.
 
     lower, upper : of the texture coordinates.
     """
+    ends = np.random.default_rng(0).uniform(lower, upper, (pairs, 2, 2))
+    ends = np.concatenate([ends, _brightest_and_darkest(texture)]).astype(np.float32)
     with dr.suspend_grad():
-        rng = mi.PCG32(size=pairs)
-        si = dr.zeros(mi.SurfaceInteraction3f, pairs)
+        si = dr.zeros(mi.SurfaceInteraction3f, len(ends))
         if mi.is_spectral:
             si.wavelengths = type(si.wavelengths)(550)
 
@@ -202,10 +220,7 @@ def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 25
             return texture.eval(si)
 
         difference = lambda f, g: dr.max(dr.abs(f - g))
-        point = lambda: dr.lerp(
-            mi.Point2f(lower), mi.Point2f(upper), mi.Point2f(rng.next_float32(), rng.next_float32())
-        )
-        p, q = point(), point()
+        p, q = (mi.Point2f(ends[:, k].T) for k in (0, 1))
         at_p, at_q = value(p), value(q)
         before = difference(at_p, at_q)
         for _ in range(steps):
@@ -216,3 +231,16 @@ def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 25
             q, at_q = dr.select(left, middle, q), dr.select(left, at_middle, at_q)
         # Rounding makes differences, too, where a texture is constant.
         return bool(dr.any((before > 1e-3 * dr.max(before)) & (difference(at_p, at_q) > 0.3 * before)))
+
+
+def _brightest_and_darkest(texture: mi.Texture) -> np.ndarray:
+    """Texture coordinates of these two texels of a bitmap: (2, 2, 2), whichever of its sides is the lower one."""
+    params = mi.traverse(texture)
+    if "data" not in params:
+        return np.zeros((0, 2, 2))
+    data = np.array(dr.detach(params["data"])).sum(2)
+    y, x = np.unravel_index([data.argmax(), data.argmin()], data.shape)
+    u, v = (x + 0.5) / data.shape[1], (y + 0.5) / data.shape[0]
+    places = np.stack([np.stack([u, w], -1) for w in (v, 1 - v)])
+    to_uv = np.array(params["to_uv"].matrix, float)
+    return (places - to_uv[:2, 2]) @ np.linalg.pinv(to_uv[:2, :2]).T

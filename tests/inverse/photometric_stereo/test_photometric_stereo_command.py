@@ -428,6 +428,7 @@ def test_disk_that_fails(folder, tmp_path, capfd, monkeypatch):
 
     monkeypatch.setattr(output, "write_exr", full)
     refused(capfd, ["run", str(folder), "--out", str(tmp_path / "out"), *QUICK, "--no-reflectance"], "No space left")
+    assert not list((tmp_path / "out").glob("*.exr"))
 
 
 def test_memory_is_checked(folder, tmp_path, capfd, monkeypatch):

@@ -140,6 +140,7 @@ def test_other_options_are_refused(folder: Path, stopped: Path, capfd) -> None:
     given = [str(folder), "--out", str(stopped), *OPTIONS, *QUICK, "--resume"]
     refused(capfd, [*given, "--spp", "4", "--dark", "0.1"], "other options (dark, spp)", "give the same ones")
     refused(capfd, [*given, "--images", "8"], "number of images")
+    assert numbers(stopped)["status"] == "interrupted"  # as before
 
 
 @pytest.mark.parametrize("what", ["images", "mask", "lights"])
@@ -158,6 +159,7 @@ def test_other_data_are_refused(folder: Path, stopped: Path, tmp_path: Path, cap
     dataset.write(tmp_path / "data", data)
     given = [str(tmp_path / "data"), "--out", str(stopped), *OPTIONS, *QUICK, "--resume"]
     refused(capfd, given, "the data set has changed", what, "put the old one back")
+    assert numbers(stopped)["status"] == "interrupted"  # as before
 
 
 @pytest.mark.parametrize("damage", ["empty", "half", "another layout"])

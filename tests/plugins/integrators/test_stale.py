@@ -198,6 +198,33 @@ def test_a_beam_that_comes_to_end_with_a_jump(make):
         assert_as_fresh(scene, used, make, "sensor.to_world")
 
 
+@pytest.mark.parametrize("kind", ["nearest", "checkerboard"])
+def test_a_texture_that_comes_to_jump(kind):
+    """It has one colour at first, as at the start of a fit."""
+    even, other = np.full((4, 4, 3), 0.5, np.float32), np.random.default_rng(0).uniform(0, 1, (4, 4, 3))
+    texture, key, value = {
+        "nearest": (
+            {"type": "bitmap", "bitmap": mi.Bitmap(even), "raw": True, "filter_type": "nearest"},
+            "board.bsdf.reflectance.data",
+            mi.TensorXf(other.astype(np.float32)),
+        ),
+        "checkerboard": (
+            {"type": "checkerboard", "color0": 0.5, "color1": 0.5},
+            "board.bsdf.reflectance.color1.value",
+            mi.Float(0.1),
+        ),
+    }[kind]
+    to_world = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
+    board = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": texture}}
+    scene, used = cases.scene(sensor=cases.camera(), board=board, sky=cases.constant()), direct_edge()
+    before = derivative(scene, used, "board.to_world")
+    params = mi.traverse(scene)
+    params[key] = value
+    params.update()
+    after = assert_as_fresh(scene, used, direct_edge, "board.to_world")
+    assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
+
+
 # ---------------------- Several scenes ----------------------
 
 

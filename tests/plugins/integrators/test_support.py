@@ -961,3 +961,14 @@ def test_images_equal_those_of_path(depth, environment, tmp_path):
     z = z if environment else z[..., 3]
     assert np.abs(z).max() < 6
     assert np.mean(z**2) < 1.2
+
+
+@pytest.mark.parametrize("filter_type", ["nearest", "bilinear"])
+def test_a_single_texel_jumps(filter_type):
+    """Of which random places know nothing."""
+    texels = np.full((64, 64, 3), 0.5, np.float32)
+    texels[13, 40] = 0.1
+    to_uv = mi.ScalarTransform4f().translate([0.3, 0.1, 0]).scale([2, -3, 1])
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": filter_type, "to_uv": to_uv}
+    scene = stage({"thing": sheet("thing", np.array([0, 0, 1]), {"type": "diffuse", "reflectance": texture})})
+    assert bool(jumping_textures(scene)) == (filter_type == "nearest")
