@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from .curves import CURVES
+from .parameters import Parameter
 
 #: Interpolated normals are those of a face if the sine of the angle between them is at most so large.
 BENT = 1e-3
@@ -55,20 +56,20 @@ class Geometry:
         meshes = tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
         return meshes + tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
 
-    def refuse_moving_others(self, changing: dict[str, mi.Object], who: str) -> None:
+    def refuse_moving_others(self, changing: list[Parameter], who: str) -> None:
         """Refuse derivatives with respect to shapes whose silhouettes are not known, inside of shape groups, too.
 
-        changing : the parameters of the scene that carry a gradient, and what each belongs to.
+        changing : the parameters of the scene that carry a gradient.
 
         Raises
         ------
         RuntimeError : one of `others`, or a shape in a group, carries a gradient in one of its own parameters.
         """
         known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
-        for key, node in changing.items():
+        for name, node, *_ in changing:
             if isinstance(node, mi.Shape) and int(node.ptr) not in known:
                 raise RuntimeError(
-                    f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{key}" carries a gradient), but its '
+                    f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{name}" carries a gradient), but its '
                     "silhouettes cannot be sampled: only triangle meshes, spheres, disks and cylinders outside of "
                     "shape groups can move. Replace it by such a mesh, or detach it."
                 )

@@ -17,7 +17,16 @@ import numpy as np
 
 from .beams import BEAMS, border_values, has_hard_beam
 from .edges import Edges, Weld
-from .meshes import Geometry, bent_faces, has_interpolated_normals, has_place, is_smooth, vertex_attributes
+from .meshes import (
+    Geometry,
+    bent_faces,
+    has_interpolated_normals,
+    has_place,
+    is_smooth,
+    objects_below,
+    vertex_attributes,
+)
+from .parameters import Parameter
 from .texture_lines import is_even, texture_values
 
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
@@ -36,15 +45,13 @@ class Sources:
 
     Parameters
     ----------
-    scene, params : the scene and its parameters.
+    scene, found : the scene and its parameters.
     geometry : its shapes.
     edges, weld : of the meshes.
     """
 
-    def __init__(
-        self, scene: mi.Scene, params: mi.SceneParameters, geometry: Geometry, edges: Edges, weld: Weld
-    ) -> None:
-        self._objects, self._numbers = _objects(scene, params, geometry)
+    def __init__(self, scene: mi.Scene, found: list[Parameter], geometry: Geometry, edges: Edges, weld: Weld) -> None:
+        self._objects, self._numbers = _objects(scene, found, geometry)
         #: Mesh → its pairs of vertices at the two sides of edges.
         self._seams = _seams(geometry, edges)
         self._attributes = {i: tuple(vertex_attributes(geometry.meshes[i])) for i in self._seams}
@@ -59,7 +66,8 @@ class Sources:
         dr.eval(self._differing)
         #: Lights and textures: by which arrays, and by which question, it is told whether something jumps.
         self._pictures = {e: (border_values, has_hard_beam) for e in scene.emitters() if e.class_name() in BEAMS}
-        self._pictures |= {o: (texture_values, is_even) for o in params.hierarchy if has_place(o) and is_even(o)}
+        even = [o for o in objects_below(scene).values() if has_place(o) and is_even(o)]
+        self._pictures |= dict.fromkeys(even, (texture_values, is_even))
         self._answers = {o: (values(o), answer(o)) for o, (values, answer) in self._pictures.items()}
         #: Vertices at different places, and pairs at the same place.
         first, place = weld.first, weld.place
@@ -74,9 +82,9 @@ class Sources:
             #: How far apart each pair may be, whatever the rounding error: scene units.
             self._tolerance = mi.Float(tolerance.astype(np.float32))
 
-    def same_objects(self, scene: mi.Scene, params: mi.SceneParameters, geometry: Geometry) -> bool:
+    def same_objects(self, scene: mi.Scene, found: list[Parameter], geometry: Geometry) -> bool:
         """Are there the same shapes, of the same size, with the same materials and lights? Asks the host alone."""
-        objects, numbers = _objects(scene, params, geometry)
+        objects, numbers = _objects(scene, found, geometry)
         same = len(objects) == len(self._objects)
         same = same and all(a is b for a, b in zip(objects, self._objects, strict=True))
         return same and numbers == self._numbers
@@ -175,16 +183,16 @@ def _coincide(positions: mi.Float, vertices: mi.UInt32) -> mi.Bool:
     return (other != i) & dr.all(p == q)
 
 
-def _objects(scene: mi.Scene, params: mi.SceneParameters, geometry: Geometry) -> tuple[list[Any], list[Any]]:
+def _objects(scene: mi.Scene, found: list[Parameter], geometry: Geometry) -> tuple[list[Any], list[Any]]:
     """All shapes, materials, textures, lights and media; and the numbers that tell what they are."""
     shapes, emitters = scene.shapes(), scene.emitters()
     bsdfs = [s.bsdf() for s in shapes]
     kinds = (mi.Shape, mi.BSDF, mi.Emitter, mi.Texture, mi.Medium)
-    nodes = [node for _, _, node, _ in params.properties.values() if isinstance(node, kinds)]
+    nodes = [p.node for p in found if isinstance(p.node, kinds)]
     numbers = [(m.vertex_count(), m.face_count(), has_interpolated_normals(m)) for m in geometry.meshes]
     numbers += [b.flags() for b in bsdfs if b is not None]
     numbers += [(e.flags(), getattr(e, "light_count", 1)) for e in emitters]
-    return [*shapes, *emitters, *bsdfs, *nodes], [*numbers, *params.properties]
+    return [*shapes, *emitters, *bsdfs, *nodes], [*numbers, *(p.name for p in found)]
 
 
 def _seams(geometry: Geometry, edges: Edges) -> dict[int, tuple[mi.UInt32, mi.UInt32, int]]:

@@ -28,6 +28,7 @@ from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
+from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.transport.paths import Depths
@@ -77,12 +78,12 @@ class BoundarySearch:
 
         sppi : samples per pixel of the boundaries at shading points.
         """
-        geometry, params = Geometry.of(scene), mi.traverse(scene)
-        self._renew(scene, params, geometry)
+        geometry, found = Geometry.of(scene), parameters(scene)
+        self._renew(scene, found, geometry)
         with dr.resume_grad():
             self._media.refuse_gradients(self.who)
             limits = (*self._media.limits(), *self._partial.limits())
-            changing = _changing(params)
+            changing = [p for p in found if dr.grad_enabled(p.value)]
             geometry.refuse_moving_others(changing, self.who)
             moving = self._what_moves(scene, sensor, geometry, changing)
         if not moving.anything:
@@ -104,9 +105,9 @@ class BoundarySearch:
 
     # ---------------------- Edges ----------------------
 
-    def _renew(self, scene, params, geometry) -> None:
+    def _renew(self, scene: mi.Scene, found: list[Parameter], geometry: Geometry) -> None:
         """Find the edges, if what they were derived from is no longer the same."""
-        same = self._sources is not None and self._sources.same_objects(scene, params, geometry)
+        same = self._sources is not None and self._sources.same_objects(scene, found, geometry)
         if not dr.flag(dr.JitFlag.FreezingScope):
             same, self._checked = same and self._sources.same_content(geometry), False
         if same:
@@ -119,7 +120,7 @@ class BoundarySearch:
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
-        self._sources = Sources(scene, params, geometry, self.edges, weld)
+        self._sources = Sources(scene, found, geometry, self.edges, weld)
         self._partial, self._media = PartialParameters(scene), Media(scene)
         self._maps = [m for s in scene.shapes() for m in mapped_horizons(s)]
 
@@ -145,10 +146,10 @@ class BoundarySearch:
 
     # ---------------------- What moves ----------------------
 
-    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry, changing: dict) -> Moving:
+    def _what_moves(self, scene: mi.Scene, sensor: mi.Sensor, geometry: Geometry, changing: list[Parameter]) -> Moving:
         moves = geometry.moving()
         # To traverse takes long in a step of milliseconds: not where shapes alone change.
-        only_shapes = all(isinstance(o, mi.Shape) for o in changing.values())
+        only_shapes = all(isinstance(p.node, mi.Shape) for p in changing)
         still = only_shapes and any(s is sensor for s in scene.sensors())
         camera = not still and any(dr.grad_enabled(value) for _, value in mi.traverse(sensor).items())
         if camera and geometry.others:
@@ -228,11 +229,3 @@ class BoundarySearch:
             # With the sensor, so that its number is given to no other one.
             self._beyond[key] = sensor, beyond_far_plane(sensor, list(moving.on_film))
         return self._beyond[key][1] if key in self._beyond else []
-
-
-def _changing(params: mi.SceneParameters) -> dict[str, mi.Object]:
-    """The parameters that carry a gradient now, and what each belongs to."""
-    # Not by `params[key]`, which also remembers every value, and takes three times as long.
-    value = lambda it, kind, node: it if kind is None else params.get_property(it, kind, node)
-    found = params.properties.items()
-    return {key: node for key, (it, kind, node, _) in found if dr.grad_enabled(value(it, kind, node))}
