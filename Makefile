@@ -20,15 +20,16 @@ $(STAMP): pyproject.toml
 demo: setup
 	$(BIN)/python -m rimlight demo --out demo
 
-# Two workers, each with all threads: the compiler, not the kernels, is what small tests wait for
+# All but the slow ones (tests/tiers.py). Two workers, each with all threads: the compiler, not the kernels, is what
+# small tests wait for
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 30
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 30 -m "not slow"
 
 # A minute's worth of them
 test-fast: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m fast
 
-# With many samples, and random ordinary scenes: 300 take about an hour, or as many as: make test-full SCENES=1000
+# All, with many samples, and random ordinary scenes: 300 take about an hour, or as many as: make test-full SCENES=1000
 SCENES ?= 300
 test-full: setup
 	RIMLIGHT_FULL=1 RIMLIGHT_SCENES=$(SCENES) $(BIN)/python -m pytest -n 2 --dist worksteal --durations 30

@@ -13,29 +13,16 @@ from pathlib import Path
 import gallery
 import pages
 import pytest
+import tiers
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared" / "data"
 
 
-#: What `make test-fast` runs: tests of one part each, and derivatives of one case of each kind.
-FAST_MODULES = (
-    "agreement batch constants edge_tree edges emitter_boxes exr finite options projection scenes what_hides zscores"
-)
-FAST_CASES = (
-    "two_triangles_green cube_depth cube_welded coloured_cube_camera textured_cube_side orthographic_camera "
-    "thin_lens_camera fisheye_camera gaussian_filter near_plane_cut smooth_torus room_cube shadow_blocker "
-    "shadow_camera shadow_light glossy_receiver open_air spot_light sun_cube led_cube distant_lights sphere_soft "
-    "cylinder_soft sky_blocker surroundings_turn glowing_torus coarse_lamp_cube reflecting_cube"
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    modules, cases = ({f"test_{name}" for name in FAST_MODULES.split()}, set(FAST_CASES.split()))
-    for item in items:
-        module = item.path.stem
-        if module in modules or (module == "test_derivatives" and item.callspec.params["case"].name in cases):
-            item.add_marker(pytest.mark.fast)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    unknown = tiers.mark(items, pytest.mark.fast, pytest.mark.slow)
+    if unknown and not any("::" in argument for argument in config.args):
+        raise pytest.UsageError(f"tests/tiers.py lists what is no test: {', '.join(sorted(unknown))}")
 
 
 def pytest_configure(config: pytest.Config) -> None:

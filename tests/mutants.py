@@ -1,8 +1,8 @@
 """Deliberate faults, one at a time, and which tests notice each:  python tests/mutants.py [--only NUMBER ...] [TEST]
 
 A test that cannot fail proves nothing. Each fault is made in a copy of the project, never in the project itself. The
-fast tests run first, and the others only if none of these fails. They stop at the third that fails, or at another
-(`--stop-at`); what no test notices is listed at the end, with exit code 1.
+fast tests run first, and those of `make test` only if none of these fails. They stop at the third that fails, or at
+another (`--stop-at`); what no test notices is listed at the end, with exit code 1.
 """
 
 from __future__ import annotations
@@ -353,7 +353,7 @@ def changed(m: Mutant, text: str) -> str:
 
 
 def failures(m: Mutant, tests: list[str], stop_at: int = 3) -> list[str]:
-    """Names of the first tests that fail with it: of the fast ones, or if none of these does, of all."""
+    """Names of the first tests that fail with it: of the fast ones, or of those of `make test`."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         copy_of_project(folder)
@@ -361,8 +361,8 @@ def failures(m: Mutant, tests: list[str], stop_at: int = 3) -> list[str]:
         file.write_text(changed(m, file.read_text()))
         # Found before the project that is installed.
         environment = {**os.environ, "PYTHONPATH": str(folder)}
-        for which in (["-m", "fast"], []):
-            options = ["-q", "-n", "2", "--maxfail", str(stop_at), "-p", "no:cacheprovider", *which]
+        for which in ("fast", "not slow"):
+            options = ["-q", "-n", "2", "--maxfail", str(stop_at), "-p", "no:cacheprovider", "-m", which]
             command = [sys.executable, "-m", "pytest", *options, *tests]
             run = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
             if run.returncode not in (0, 1, 2, 5):  # 5: none of them is fast

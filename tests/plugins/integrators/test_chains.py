@@ -1,5 +1,10 @@
-"""Vertices that slide: what mirrors show, what is seen past edges that stand still, paths without a limit."""
+"""Vertices that slide: what mirrors show, what is seen past edges that stand still, paths without a limit.
 
+Finite differences are stored; ``RENEW_REFERENCES=1 python -m pytest tests/plugins/integrators/test_chains.py`` makes
+them anew.
+"""
+
+import cases
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -7,7 +12,7 @@ import pytest
 import rooms
 from building import camera, diffuse, film, horizontal, light, quad, scene
 
-from rimlight.checks import Motion, compare, derivative_image, finite_differences
+from rimlight.checks import Motion, compare, derivative_image
 from rimlight.transport.log import Log
 
 CAMERA_SIDE = {"key": "sensor.to_world", "direction": [1, 0.2, 0.3]}
@@ -22,9 +27,11 @@ def derivatives(scene, motion, runs, spp, **integrator):
     return np.array([derivative_image(scene, it, motion, spp=spp, seed=i) for i in range(runs)], np.float64)
 
 
-def agreement(scene, motion, depth, *, step, runs=8, spp=256, reference_spp=1024):
+def agreement(name, scene, motion, depth, *, step, runs=8, spp=64):
     path = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
-    expected = finite_differences(scene, motion, step=step, runs=8, spp=reference_spp, integrator=path)
+    expected = cases.stored_differences(
+        f"chains_{name}", [str(motion)], scene, motion, step=step, runs=12, spp=4096, integrator=path
+    )
     return compare(derivatives(scene, motion, runs, spp, max_depth=depth), expected)
 
 
@@ -42,7 +49,7 @@ def test_what_a_mirror_shows_slides():
         },
         lamp=horizontal((0, 6, 0), 1.5, "lamp", down=True, bsdf=diffuse(0.0), emitter=light(20, 20, 20)),
     )
-    found = agreement(s, Motion(s, **CAMERA_SIDE), 3, step=2e-2)
+    found = agreement("mirror", s, Motion(s, **CAMERA_SIDE), 3, step=2e-2)
     print(found)
     assert not found.zero and not found.faults(noise=0.1), str(found)
 
@@ -64,7 +71,7 @@ def test_what_moves_past_an_edge_that_stands_still():
         wall=wall,
         lamp=quad((-2, 4, 2), (4, 0, 0), (0, 1, 0), "lamp", bsdf=diffuse(0.0), emitter=light(12, 12, 12)),
     )
-    found = agreement(s, Motion(s, key="wall.to_world", direction=[1, 0, 0]), 3, step=5e-2, spp=2048)
+    found = agreement("wall", s, Motion(s, key="wall.to_world", direction=[1, 0, 0]), 3, step=5e-2, spp=2048)
     print(found)
     assert not found.zero and not found.faults(noise=0.25), str(found)
 
@@ -99,6 +106,6 @@ def test_a_ball_on_a_floor():
         thing={"type": "sphere", "center": [0, 0.4, 0], "radius": 0.4, "bsdf": diffuse(0.8, 0.4, 0.2)},
         lamp=horizontal((-1.2, 2, -1), 0.4, "lamp", down=True, bsdf=diffuse(0.0), emitter=light(20, 20, 20)),
     )
-    found = agreement(s, Motion(s, key="thing.to_world", direction=[1, 0, 0.3]), 4, step=5e-3, reference_spp=4096)
+    found = agreement("ball", s, Motion(s, key="thing.to_world", direction=[1, 0, 0.3]), 4, step=5e-3, spp=256)
     print(found)
     assert not found.zero and not found.faults(noise=0.1), str(found)

@@ -65,7 +65,7 @@ def test_agrees_with_finite_differences(name):
     reference = cases.stored_differences(
         name, [str(motion)], scene, motion, step=4e-3, runs=16, spp=4096, integrator=path
     )
-    images = [derivative_image(scene, integrator, motion, spp=512, seed=i) for i in range(16)]
+    images = [derivative_image(scene, integrator, motion, spp=192, seed=i) for i in range(16)]
     agreement = compare(np.array(images, np.float64), reference)
     print(agreement)
     assert not agreement.faults(noise=NOISE)

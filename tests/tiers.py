@@ -1,0 +1,168 @@
+"""Which tests `make test-fast` and `make test` leave out. `make test-full` runs all, with many samples.
+
+A test is slow if it takes seconds, and if what it would notice is noticed by others as well, or is of interest to
+releases only. No deliberate fault of `mutants.py` is noticed by slow tests alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+#: What `make test-fast` runs: tests of one part each, and derivatives of one case of each kind.
+FAST_MODULES = (
+    "agreement batch constants edge_tree edges emitter_boxes exr finite options projection scenes what_hides zscores"
+)
+FAST_CASES = (
+    "two_triangles_green cube_depth cube_welded coloured_cube_camera textured_cube_side orthographic_camera "
+    "thin_lens_camera fisheye_camera gaussian_filter near_plane_cut smooth_torus room_cube shadow_blocker "
+    "shadow_camera shadow_light glossy_receiver open_air spot_light sun_cube led_cube distant_lights sphere_soft "
+    "cylinder_soft sky_blocker surroundings_turn glowing_torus coarse_lamp_cube reflecting_cube"
+)
+
+#: Cases that `make test` has besides: those that notice a fault, and one of each kind that takes longer.
+MORE_CASES = (
+    "field_of_view thin_lens_focus fisheye_field_of_view batch_camera sample_border leaving_the_frame near_light "
+    "spot_cube spot_light_turn spot_camera sun_turns lit_room_light led_moves distant_cube discs_lights discs_radius "
+    "smooth_torus_sun sphere_sun disk_soft sphere_light surroundings reflecting_ball light_out_of_frame "
+    "sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
+    "checkerboard_close aligned_ball mirrored_lamp beam_turns "
+    "picture_turns cornell_box hidden_shadow box_behind_glass"
+)
+
+#: Slow tests, by how their names begin.
+SLOW = """
+test_aov_edge.py::test_backward_is_the_transpose_of_forward[camera-box-None]
+test_blinn_phong.py::test_shadows_and_reflections_move
+test_blinn_phong.py::test_textures_in_a_render[diffuse_reflectance-direct_edge]
+test_blinn_phong.py::test_textures_in_a_render[roughness-prb_edge]
+test_blinn_phong.py::test_textures_in_a_render[specular_reflectance-direct_edge]
+test_blinn_phong.py::test_textures_in_a_render[specular_reflectance-prb_edge]
+test_chains.py::test_a_ball_on_a_floor
+test_chains.py::test_forward_equals_backward[corner_dolly]
+test_chains.py::test_what_moves_past_an_edge_that_stands_still
+test_coarse_meshes.py::test_agrees_with_finite_differences[indirect]
+test_coarse_meshes.py::test_agrees_with_finite_differences[normal map]
+test_coarse_meshes.py::test_backward[indirect]
+test_convergence.py::test_error_falls_with_samples[cornell_box_camera]
+test_convergence.py::test_error_falls_with_samples[corner_dolly]
+test_convergence.py::test_error_falls_with_samples[room_camera]
+test_convergence.py::test_error_falls_with_samples[room_light]
+test_convergence.py::test_error_falls_with_samples[smooth_torus_sun]
+test_convergence.py::test_error_falls_with_samples[sphere_soft]
+test_convergence.py::test_error_falls_with_samples[thin_lens_camera]
+test_cuts.py::test_frozen_functions[prb_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[cube.vertex_positions-direct_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[floor.vertex_positions-prb_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[sensor.to_world-prb_edge]
+test_direct_edge.py::test_borders_of_beams_are_warned_about_in_indirect_light_only[lamp1
+test_direct_edge.py::test_borders_of_beams_are_warned_about_in_indirect_light_only[lamp2
+test_direct_edge.py::test_gradients_are_the_sum_of_those_of_the_terms[integrator1]
+test_direct_edge.py::test_normal_maps_are_warned_about_in_indirect_light_only
+test_direct_edge.py::test_other_variants_agree_with_rgb[llvm_ad_mono]
+test_distant_lights.py::test_derivatives_of_images[angular_radius-diffuse]
+test_distant_lights.py::test_derivatives_of_images[background.value-diffuse]
+test_distant_lights.py::test_derivatives_of_images[directions-diffuse]
+test_distant_lights.py::test_derivatives_of_images[irradiance-diffuse]
+test_fine_meshes.py::test_light_of_coarse_lamps_backward[prb_edge]
+test_fine_meshes.py::test_outlines_count_once
+test_fit_gradients.py::test_derivative_image_is_that_on_the_way
+test_fit_gradients.py::test_gradient_is_that_of_the_loss[camera-shift]
+test_fit_gradients.py::test_gradient_is_that_of_the_loss[camera-turn]
+test_fit_gradients.py::test_gradient_is_that_of_the_loss[vertex]
+test_fit_gradients.py::test_replayed_gradients_are_the_same[prb]
+test_fit_gradients.py::test_replayed_gradients_are_the_same[prb_edge]
+test_fits.py::test_several_starts_find_what_one_does_not[1]
+test_freezing.py::test_replay_sees_new_values[prb_edge-batch
+test_freezing.py::test_replay_sees_new_values[prb_edge-cube
+test_freezing.py::test_replay_sees_new_values[prb_edge-fisheye
+test_freezing.py::test_replay_sees_new_values[prb_edge-picture-lamp
+test_freezing.py::test_replay_sees_new_values[prb_edge-room-light
+test_freezing.py::test_replay_sees_new_values[prb_edge-room-sensor
+test_freezing.py::test_replay_sees_new_values[prb_edge-sphere
+test_freezing.py::test_replay_sees_new_values[prb_edge-spot
+test_freezing.py::test_replay_sees_new_values[prb_edge-torus
+test_freezing.py::test_replay_sees_new_values[prb_edge-two_triangles
+test_hard_cases.py::test_closed_room_looks_the_same_from_everywhere
+test_hard_cases.py::test_derivatives_do_not_depend_on_the_scale[prb_edge-0.001]
+test_hard_cases.py::test_derivatives_do_not_depend_on_the_scale[prb_edge-1000000.0]
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-black]
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-glossy]
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-light in the floor]
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-meshes]
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-sky]
+test_hard_cases.py::test_small_scenes_give_finite_derivatives[prb_edge]
+test_invariants.py::test_linear_in_the_motion[prb_edge]
+test_invariants.py::test_nothing_changes_if_all_grows[prb_edge]
+test_invariants.py::test_nothing_changes_if_all_moves[prb_edge]
+test_invariants.py::test_seams_do_not_count[prb_edge]
+test_invariants.py::test_the_derivative_stays[merged-direct_edge]
+test_invariants.py::test_the_derivative_stays[subdivided-direct_edge]
+test_light_choice.py::test_frozen_functions
+test_light_choice.py::test_same_derivative_with_less_noise[integrator1]
+test_mirrors.py::test_frozen_functions[prb_edge]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[bumpy_ball-ball.to_world-prb_edge]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[glass_ball-ball.to_world-prb_edge]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[mapped_ball-ball.bsdf.normalmap.data-prb_edge]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[mapped_ball-ball.vertex_positions-prb_edge]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[over_mirror-cube.vertex_positions-direct_edge]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[over_mirror-mirror.vertex_positions-prb_edge]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[two_mirrors-sensor.to_world-prb_edge]
+test_mirrors.py::test_texture_coordinates_and_flipped_normals_do_not_change_mirrors[False-True]
+test_mirrors.py::test_texture_coordinates_and_flipped_normals_do_not_change_mirrors[True-False]
+test_mirrors.py::test_two_textures_of_one_shape
+test_photometric_stereo.py::test_coat_needs_evidence
+test_photometric_stereo.py::test_colours_under_a_glaze
+test_photometric_stereo.py::test_gradients_with_interreflections[depth
+test_photometric_stereo.py::test_heights_of_steps_follow_from_their_shadows[orthographic]
+test_prb_edge.py::test_forward_and_backward_agree[vertices
+test_prb_edge.py::test_other_variants_agree_with_rgb
+test_random_scenes.py::test_agrees_with_finite_differences[17]
+test_random_scenes.py::test_agrees_with_finite_differences[44]
+test_random_scenes.py::test_agrees_with_finite_differences[48]
+test_reflectance.py::test_dictionary_of_the_package
+test_reflectance.py::test_reduction_finds_the_lobes_of_the_tables
+test_reflectance.py::test_reduction_keeps_few_alphas_and_etas
+test_reproduce.py::test_small_fit_converges[fig6b]
+test_reproduce.py::test_small_fit_converges[fig6c]
+test_reproduce.py::test_small_fit_converges[fig6d]
+test_reproduce.py::test_small_fit_converges[fig6e]
+test_reproduce.py::test_small_fit_converges[fig6f]
+test_rig.py::test_forward_and_backward_agree[all_kinds-True-gaussian]
+test_rig.py::test_forward_and_backward_agree[small_lights-True-box]
+test_rig.py::test_interior_agrees_with_prb_edge[cube.bsdf.reflectance.value-small_lights]
+test_rig.py::test_interior_agrees_with_prb_edge[cube.vertex_normals-small_lights]
+test_rig.py::test_interior_agrees_with_prb_edge[cube.vertex_positions-all_kinds]
+test_rig.py::test_interior_agrees_with_prb_edge[sensor.to_world-all_kinds]
+test_stale.py::test_a_beam_that_comes_to_end_with_a_jump[prb_edge]
+test_stale.py::test_flat_square_is_folded[prb_edge]
+test_stale.py::test_material_is_exchanged[prb_edge]
+test_stale.py::test_meshes_in_several_scenes[prb_edge]
+test_stale.py::test_replay_sees_that_meshes_have_parted[prb_edge]
+test_support.py::test_exact_on_charts
+"""
+
+
+def mark(items: Iterable[Any], fast: Any, slow: Any) -> set[str]:
+    """Add these marks to the tests that need them. Returns what is listed here of their files, and is no test."""
+    fast_modules, fast_cases = set(FAST_MODULES.split()), set(FAST_CASES.split())
+    often = fast_cases | set(MORE_CASES.split())
+    files: set[str] = set()
+    met: set[str] = set()
+    for item in items:
+        file = item.path.name
+        files.add(file)
+        if file == "test_derivatives.py":
+            case = item.callspec.params["case"].name
+            is_fast, is_slow = case in fast_cases, case not in often
+            met.add(case)
+        else:
+            begins = [start for start in SLOW.split("\n") if start and f"{file}::{item.name}".startswith(start)]
+            is_fast, is_slow = file[len("test_") : -len(".py")] in fast_modules, bool(begins)
+            met.update(begins)
+        if is_fast:
+            item.add_marker(fast)
+        if is_slow:
+            item.add_marker(slow)
+    listed = {start for start in SLOW.split("\n") if start.partition("::")[0] in files}
+    return (listed | (often if "test_derivatives.py" in files else set())) - met
