@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import operator
 import re
+from functools import cache
 from typing import NamedTuple
 
 #: Numbers that say nothing but "none", "one more", "twice", "half": indices, signs, dimensions, coefficients.
@@ -33,6 +34,7 @@ class Number(NamedTuple):
     value: float
 
 
+@cache
 def numbers_in_source(file: str, source: str) -> set[Number]:
     """The numeric constants of a module.
 

@@ -22,17 +22,21 @@ FAST_CASES = (
 
 #: Cases that `make test` has besides: those that notice a fault, and one of each kind that takes longer.
 MORE_CASES = (
-    "field_of_view thin_lens_focus fisheye_field_of_view batch_camera sample_border leaving_the_frame near_light "
-    "spot_cube spot_light_turn spot_camera sun_turns lit_room_light led_moves distant_cube discs_lights discs_radius "
-    "smooth_torus_sun sphere_sun disk_soft sphere_light surroundings reflecting_ball light_out_of_frame "
-    "sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
-    "checkerboard_close aligned_ball mirrored_lamp beam_turns "
-    "picture_turns cornell_box hidden_shadow box_behind_glass"
+    "batch_camera leaving_the_frame near_light spot_cube spot_light_turn spot_camera sun_turns lit_room_light "
+    "led_moves distant_cube discs_lights discs_radius smooth_torus_sun sphere_sun sphere_light surroundings "
+    "reflecting_ball light_out_of_frame sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
+    "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
+    "box_behind_glass"
 )
 
 #: Slow tests, by how their names begin.
 SLOW = """
+test_adversarial.py::test_scores_survive_a_checkpoint
+test_adversarial.py::test_the_sign_is_seen_and_moves
 test_aov_edge.py::test_backward_is_the_transpose_of_forward[camera-box-None]
+test_aov_edge.py::test_frozen_is_unfrozen[lit-sensor.to_world]
+test_aov_edge.py::test_other_variants[llvm_ad_mono]
+test_batch.py::test_forward_and_backward_agree[prb_edge
 test_blinn_phong.py::test_shadows_and_reflections_move
 test_blinn_phong.py::test_textures_in_a_render[diffuse_reflectance-direct_edge]
 test_blinn_phong.py::test_textures_in_a_render[roughness-prb_edge]
@@ -41,11 +45,14 @@ test_blinn_phong.py::test_textures_in_a_render[specular_reflectance-prb_edge]
 test_chains.py::test_a_ball_on_a_floor
 test_chains.py::test_forward_equals_backward[corner_dolly]
 test_chains.py::test_what_moves_past_an_edge_that_stands_still
+test_coarse_meshes.py::test_agrees_with_finite_differences[camera]
 test_coarse_meshes.py::test_agrees_with_finite_differences[indirect]
 test_coarse_meshes.py::test_agrees_with_finite_differences[normal map]
 test_coarse_meshes.py::test_backward[indirect]
+test_coarse_meshes.py::test_backward[lamp moves]
 test_convergence.py::test_error_falls_with_samples[cornell_box_camera]
 test_convergence.py::test_error_falls_with_samples[corner_dolly]
+test_convergence.py::test_error_falls_with_samples[open_air]
 test_convergence.py::test_error_falls_with_samples[room_camera]
 test_convergence.py::test_error_falls_with_samples[room_light]
 test_convergence.py::test_error_falls_with_samples[smooth_torus_sun]
@@ -55,44 +62,54 @@ test_cuts.py::test_frozen_functions[prb_edge]
 test_cuts.py::test_gradients_are_those_of_forward_mode[cube.vertex_positions-direct_edge]
 test_cuts.py::test_gradients_are_those_of_forward_mode[floor.vertex_positions-prb_edge]
 test_cuts.py::test_gradients_are_those_of_forward_mode[sensor.to_world-prb_edge]
-test_direct_edge.py::test_borders_of_beams_are_warned_about_in_indirect_light_only[lamp1
-test_direct_edge.py::test_borders_of_beams_are_warned_about_in_indirect_light_only[lamp2
-test_direct_edge.py::test_gradients_are_the_sum_of_those_of_the_terms[integrator1]
-test_direct_edge.py::test_normal_maps_are_warned_about_in_indirect_light_only
+test_direct_edge.py::test_forward_and_backward_agree[crop_window]
+test_direct_edge.py::test_forward_and_backward_agree[cube_depth]
+test_direct_edge.py::test_gradients_are_the_sum_of_those_of_the_terms
 test_direct_edge.py::test_other_variants_agree_with_rgb[llvm_ad_mono]
 test_distant_lights.py::test_derivatives_of_images[angular_radius-diffuse]
 test_distant_lights.py::test_derivatives_of_images[background.value-diffuse]
 test_distant_lights.py::test_derivatives_of_images[directions-diffuse]
 test_distant_lights.py::test_derivatives_of_images[irradiance-diffuse]
+test_docs.py::test_snippets_run[photometric_stereo.md]
+test_fine_meshes.py::test_glass[alone]
 test_fine_meshes.py::test_light_of_coarse_lamps_backward[prb_edge]
 test_fine_meshes.py::test_outlines_count_once
 test_fit_gradients.py::test_derivative_image_is_that_on_the_way
 test_fit_gradients.py::test_gradient_is_that_of_the_loss[camera-shift]
 test_fit_gradients.py::test_gradient_is_that_of_the_loss[camera-turn]
 test_fit_gradients.py::test_gradient_is_that_of_the_loss[vertex]
+test_fit_gradients.py::test_replayed_gradients_are_the_same[direct_edge]
 test_fit_gradients.py::test_replayed_gradients_are_the_same[prb]
 test_fit_gradients.py::test_replayed_gradients_are_the_same[prb_edge]
-test_fits.py::test_several_starts_find_what_one_does_not[1]
+test_fits.py::test_several_starts_find_what_one_does_not
+test_freezing.py::test_replay_sees_new_values[direct_edge-batch
+test_freezing.py::test_replay_sees_new_values[direct_edge-fisheye
+test_freezing.py::test_replay_sees_new_values[direct_edge-room-light
+test_freezing.py::test_replay_sees_new_values[direct_edge-sphere
+test_freezing.py::test_replay_sees_new_values[direct_edge-torus
 test_freezing.py::test_replay_sees_new_values[prb_edge-batch
 test_freezing.py::test_replay_sees_new_values[prb_edge-cube
 test_freezing.py::test_replay_sees_new_values[prb_edge-fisheye
-test_freezing.py::test_replay_sees_new_values[prb_edge-picture-lamp
+test_freezing.py::test_replay_sees_new_values[prb_edge-picture
 test_freezing.py::test_replay_sees_new_values[prb_edge-room-light
 test_freezing.py::test_replay_sees_new_values[prb_edge-room-sensor
 test_freezing.py::test_replay_sees_new_values[prb_edge-sphere
 test_freezing.py::test_replay_sees_new_values[prb_edge-spot
 test_freezing.py::test_replay_sees_new_values[prb_edge-torus
 test_freezing.py::test_replay_sees_new_values[prb_edge-two_triangles
+test_hard_cases.py::test_closed_room_has_no_boundaries[prb_edge]
 test_hard_cases.py::test_closed_room_looks_the_same_from_everywhere
-test_hard_cases.py::test_derivatives_do_not_depend_on_the_scale[prb_edge-0.001]
-test_hard_cases.py::test_derivatives_do_not_depend_on_the_scale[prb_edge-1000000.0]
-test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-black]
-test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-glossy]
-test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-light in the floor]
-test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-meshes]
-test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-sky]
+test_hard_cases.py::test_derivatives_do_not_depend_on_the_scale[prb_edge
+test_hard_cases.py::test_image_and_derivatives_are_finite[direct_edge-glossy]
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-black
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-glossy
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-light in the floor
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-light on the floor
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-meshes
+test_hard_cases.py::test_image_and_derivatives_are_finite[prb_edge-sky
 test_hard_cases.py::test_small_scenes_give_finite_derivatives[prb_edge]
-test_invariants.py::test_linear_in_the_motion[prb_edge]
+test_hard_cases.py::test_white_cube_under_a_white_sky_is_invisible[prb_edge]
+test_invariants.py::test_linear_in_the_motion
 test_invariants.py::test_nothing_changes_if_all_grows[prb_edge]
 test_invariants.py::test_nothing_changes_if_all_moves[prb_edge]
 test_invariants.py::test_seams_do_not_count[prb_edge]
@@ -101,22 +118,25 @@ test_invariants.py::test_the_derivative_stays[subdivided-direct_edge]
 test_light_choice.py::test_frozen_functions
 test_light_choice.py::test_same_derivative_with_less_noise[integrator1]
 test_mirrors.py::test_frozen_functions[prb_edge]
-test_mirrors.py::test_gradients_are_those_of_forward_mode[bumpy_ball-ball.to_world-prb_edge]
+test_mirrors.py::test_frozen_functions_with_normal_maps
+test_mirrors.py::test_gradients_are_those_of_forward_mode[bumpy_ball
 test_mirrors.py::test_gradients_are_those_of_forward_mode[glass_ball-ball.to_world-prb_edge]
 test_mirrors.py::test_gradients_are_those_of_forward_mode[mapped_ball-ball.bsdf.normalmap.data-prb_edge]
 test_mirrors.py::test_gradients_are_those_of_forward_mode[mapped_ball-ball.vertex_positions-prb_edge]
 test_mirrors.py::test_gradients_are_those_of_forward_mode[over_mirror-cube.vertex_positions-direct_edge]
-test_mirrors.py::test_gradients_are_those_of_forward_mode[over_mirror-mirror.vertex_positions-prb_edge]
-test_mirrors.py::test_gradients_are_those_of_forward_mode[two_mirrors-sensor.to_world-prb_edge]
-test_mirrors.py::test_texture_coordinates_and_flipped_normals_do_not_change_mirrors[False-True]
-test_mirrors.py::test_texture_coordinates_and_flipped_normals_do_not_change_mirrors[True-False]
+test_mirrors.py::test_gradients_are_those_of_forward_mode[over_mirror-mirror
+test_mirrors.py::test_gradients_are_those_of_forward_mode[two_mirrors
+test_mirrors.py::test_texture_coordinates_and_flipped_normals_do_not_change_mirrors
 test_mirrors.py::test_two_textures_of_one_shape
 test_photometric_stereo.py::test_coat_needs_evidence
 test_photometric_stereo.py::test_colours_under_a_glaze
 test_photometric_stereo.py::test_gradients_with_interreflections[depth
+test_photometric_stereo.py::test_gradients_with_interreflections[normals
 test_photometric_stereo.py::test_heights_of_steps_follow_from_their_shadows[orthographic]
+test_photometric_stereo_resume.py::test_killed_runs_resume_bit_by_bit
 test_prb_edge.py::test_forward_and_backward_agree[vertices
 test_prb_edge.py::test_other_variants_agree_with_rgb
+test_prb_edge.py::test_terms_add_up[vertices-False]
 test_random_scenes.py::test_agrees_with_finite_differences[17]
 test_random_scenes.py::test_agrees_with_finite_differences[44]
 test_random_scenes.py::test_agrees_with_finite_differences[48]
@@ -128,18 +148,27 @@ test_reproduce.py::test_small_fit_converges[fig6c]
 test_reproduce.py::test_small_fit_converges[fig6d]
 test_reproduce.py::test_small_fit_converges[fig6e]
 test_reproduce.py::test_small_fit_converges[fig6f]
-test_rig.py::test_forward_and_backward_agree[all_kinds-True-gaussian]
-test_rig.py::test_forward_and_backward_agree[small_lights-True-box]
-test_rig.py::test_interior_agrees_with_prb_edge[cube.bsdf.reflectance.value-small_lights]
-test_rig.py::test_interior_agrees_with_prb_edge[cube.vertex_normals-small_lights]
+test_rig.py::test_forward_and_backward_agree
+test_rig.py::test_frozen_steps[sensor.to_world]
+test_rig.py::test_interior_agrees_with_prb_edge[cube.bsdf
+test_rig.py::test_interior_agrees_with_prb_edge[cube.vertex_normals
 test_rig.py::test_interior_agrees_with_prb_edge[cube.vertex_positions-all_kinds]
 test_rig.py::test_interior_agrees_with_prb_edge[sensor.to_world-all_kinds]
+test_rig.py::test_layers_agree_with_path[True-{'max_depth': 8, 'rr_depth': 2}]
+test_rig.py::test_monochrome
 test_stale.py::test_a_beam_that_comes_to_end_with_a_jump[prb_edge]
+test_stale.py::test_a_texture_that_comes_to_jump[checkerboard]
 test_stale.py::test_flat_square_is_folded[prb_edge]
 test_stale.py::test_material_is_exchanged[prb_edge]
+test_stale.py::test_material_is_exchanged[rig]
 test_stale.py::test_meshes_in_several_scenes[prb_edge]
+test_stale.py::test_meshes_in_several_scenes[rig]
+test_stale.py::test_meshes_that_part[prb_edge]
 test_stale.py::test_replay_sees_that_meshes_have_parted[prb_edge]
+test_support.py::test_exact_in_these_lights[`area` with a bilinear bitmap, `envmap`, `projector`-passed]
 test_support.py::test_exact_on_charts
+test_symmetric_views.py::test_hidden_edges_do_not_count[coloured ball]
+test_symmetric_views.py::test_hidden_edges_do_not_count[cube turned about an axis]
 """
 
 

@@ -259,10 +259,13 @@ def test_polarised_variants_are_refused():
 
 
 def warnings_of(scene, key, options, **motion) -> str:
+    """Of the search for boundaries, which each derivative begins with."""
+    θ, it = mi.Float(0), integrator(**options)
+    dr.enable_grad(θ)
+    Motion(scene, key, **motion).apply(θ)
     with cases.messages() as found:
-        it = integrator(**options)
         for _ in range(2):
-            derivative_image(scene, it, Motion(scene, key, **motion), spp=1)
+            it.find_boundaries(scene)
     return "\n".join(m for m in found if "_edge: " in m or "rig: " in m)
 
 
