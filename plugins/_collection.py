@@ -43,12 +43,12 @@ class _Collector:
             if self.guards or not self.enabled:
                 return
             # The rest of a function that `dr.freeze` records does not belong to us. Nobody tells when it ends: let the
-            # collector go on, but not see what is there already. (Unless the user has done the same.) An exception ends
-            # the recording, and what its traceback holds is to be collected.
+            # collector go on, but not see what is there already. (If the user has done the same, that ends with it.) An
+            # exception ends the recording, and what its traceback holds is to be collected.
             if raised and self.set_aside:
                 gc.unfreeze()
                 self.set_aside = False
-            elif dr.flag(dr.JitFlag.FreezingScope) and not raised and not gc.get_freeze_count():
+            elif dr.flag(dr.JitFlag.FreezingScope) and not raised:
                 gc.freeze()
                 self.set_aside = True
             gc.enable()
@@ -80,7 +80,7 @@ def no_collection() -> Iterator[None]:
 
     What Dr.Jit has scheduled before, and its pending side effects, are evaluated first, and those from in here at the
     end, unless an exception is raised. In a function that `dr.freeze` records, what exists when it ends is kept from
-    the collector until the next call outside of one.
+    the collector until the next call outside of one. (A `gc.freeze()` of yours ends then, too.)
     """
     # The generator that Python has made for this function is an allocation, and with it comes the collection that is
     # due, if one is. That costs a loop of short steps nothing, where `gc.collect()` in each would be most of its time.

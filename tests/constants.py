@@ -95,8 +95,11 @@ def numbers_in_source(file: str, source: str) -> set[Number]:
         return None
 
     def is_hexadecimal(node: ast.AST) -> bool:
-        return isinstance(node, ast.Constant) and (ast.get_source_segment(source, node) or "").lower().startswith("0x")
+        # Offsets are counted in bytes. (`ast.get_source_segment` splits the whole source for each node.)
+        start = lambda: lines[node.lineno - 1][node.col_offset : node.col_offset + 2]
+        return isinstance(node, ast.Constant) and start().lower() == b"0x"
 
+    lines = source.encode("utf-8").split(b"\n")
     in_function = lambda where: where.endswith("()")
     bits = lambda node: isinstance(node, (ast.BinOp, ast.AugAssign)) and isinstance(node.op, _BITS)
     visit(ast.parse(source), "")

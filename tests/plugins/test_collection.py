@@ -199,8 +199,13 @@ def frozen(integrator, between):
     return dr.freeze(step, state_fn=lambda scene, integrator, *_: integrator.find_boundaries(scene))
 
 
-def test_scenes_outlive_the_recording_of_a_function():
-    """Of the user's, who has no guard around it. Dr.Jit ends the process where a scene is freed there."""
+@pytest.mark.parametrize("froze", [False, True])
+def test_scenes_outlive_the_recording_of_a_function(froze):
+    """Of the user's, who has no guard around it, and may have frozen the collector's objects before. Dr.Jit ends the
+    process where a scene is freed there."""
+    gc.unfreeze()
+    if froze:
+        gc.freeze()
     scene, integrator = garbage.scene(1), mi.load_dict({"type": "direct_edge", "sppi": 0})
     params = mi.traverse(scene)
     values = mi.Float(np.array(params[KEY]).tolist())
