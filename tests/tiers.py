@@ -187,6 +187,9 @@ test_stale.py::test_meshes_that_part[prb_edge]
 test_stale.py::test_replay_sees_that_meshes_have_parted[prb_edge]
 test_support.py::test_exact_in_these_lights[`area` with a bilinear bitmap, `envmap`, `projector`-passed]
 test_support.py::test_exact_on_charts
+test_support.py::test_files_equal_meshes_in_memory[obj-face_normals]
+test_support.py::test_files_equal_meshes_in_memory[ply-face_normals]
+test_support.py::test_files_equal_meshes_in_memory[serialized-face_normals]
 test_symmetric_views.py::test_hidden_edges_do_not_count[coloured ball]
 test_symmetric_views.py::test_hidden_edges_do_not_count[cube turned about an axis]
 """
