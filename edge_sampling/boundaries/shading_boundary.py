@@ -227,20 +227,13 @@ class ShadingBoundary:
             lift = spawn_ray(scene, si, towards).o - si.p
             x = mi.Point3f(si.p + lift)
             outline = self.silhouettes.point(placement, sample, x)
-            p = outline.p
-            distance = dr.norm(p - x)
+            p, distance = outline.p, dr.norm(outline.p - x)
             ω = (p - x) / distance
             n_dl = dr.cross(ω, outline.tangent) / (distance * sample.density)
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
             active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
-            outward = outline.outward(across, ω)
-            if self.silhouettes.lines is not None:
-                # Beside a line in which meshes cut through each other, both sides slide past it. One of them is looked
-                # at, by chance.
-                one = dr.select(sampler.next_1d(active) < 0.5, mi.Float(1), -1)
-                outward = dr.select(outline.is_line, one, outward)
-                n_dl = dr.select(outline.is_line, 2 * n_dl, n_dl)
+            outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
             # Of a crease, both sides are faces of its own.
             near = 1 - vicinity.far(dr.square(distance))
             active &= (outward != 0) | (near > 0)
@@ -248,13 +241,7 @@ class ShadingBoundary:
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
             def look(side, active, slack=1):
-                """What is seen beside the edge, unless something before the edge hides it."""
-                ray = spawn_ray(scene, si, dr.normalize(mi.Point3f(p + side * aside * across) - x))
-                pi = scene.ray_intersect_preliminary(ray, active=active)
-                y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-                # Not a surface on which the edge lies: beside the edge, that may be met a little earlier.
-                off = dr.abs_dot(y.n, p - y.p) > slack * aside
-                return ray, pi, y, pi.is_valid() & (pi.t < distance) & off, pi.is_valid() & ~off
+                return _look(scene, si, x, p, side * aside * across, slack * aside, distance, active)
 
             side = dr.select(outward != 0, outward, 1)
             ray, pi, y, hidden, own = look(side, active)
@@ -296,6 +283,17 @@ class ShadingBoundary:
             value = -side * L * (edge - beyond)
             return value + faces * edge if tracer.scatters(2) else value
 
+    def _outward(self, outline, across, ω, n_dl, sampler, active) -> tuple[mi.Float, mi.Vector3f]:
+        """The side of an edge on which its faces are not, 1 or −1 along `across`; 0 if they are on both. And `n_dl`,
+        which is twice as large where one of two sides is looked at."""
+        outward = outline.outward(across, ω)
+        if self.silhouettes.lines is None:
+            return outward, n_dl
+        # Beside a line in which meshes cut through each other, both sides slide past it. One of them is looked at, by
+        # chance.
+        one = dr.select(sampler.next_1d(active) < 0.5, mi.Float(1), -1)
+        return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, 2 * n_dl, n_dl)
+
     def _emitted(self, tracer, point, ray, y, ω, pdf, active, light: mi.EmitterPtr, found_too: mi.Bool) -> mi.Spectrum:
         """Light that one light emits at y towards a point. pdf : density of ω among samples of the BSDF there.
         found_too : may the edge throw a shadow that is found from the light?"""
@@ -319,6 +317,20 @@ class ShadingBoundary:
         if len(self.smooth_lamps):
             L *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
         return L
+
+
+def _look(scene, si, x, p, beside, aside, distance, active):
+    """What is seen from x at the point p of an edge and a little beside it: ray, intersections; whether something
+    before the edge hides it; and whether it is a surface on which the edge lies.
+
+    aside : how far from the edge such a surface may be. distance : from x to p.
+    """
+    ray = spawn_ray(scene, si, dr.normalize(mi.Point3f(p + beside) - x))
+    pi = scene.ray_intersect_preliminary(ray, active=active)
+    y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    # Not a surface on which the edge lies: beside the edge, that may be met a little earlier.
+    off = dr.abs_dot(y.n, p - y.p) > aside
+    return ray, pi, y, pi.is_valid() & (pi.t < distance) & off, pi.is_valid() & ~off
 
 
 def _turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:
