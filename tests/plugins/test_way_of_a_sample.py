@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from functools import cached_property
 from pathlib import Path
@@ -79,3 +80,14 @@ def test_is_short(root, term, functions, files):
     print(len(way.functions), len(found))
     assert len(way.functions) <= functions
     assert len(found) <= files
+
+
+def test_files_and_functions_are_short(root):
+    files = [p for folder in ("plugins", "edge_sampling") for p in (root / folder).rglob("*.py")]
+    assert files
+    long = [p.name for p in files if len(p.read_text(encoding="utf-8").splitlines()) > 450]
+    for p in files:
+        nodes = ast.walk(ast.parse(p.read_text(encoding="utf-8")))
+        functions = [n for n in nodes if isinstance(n, ast.FunctionDef)]
+        long += [f"{p.name}: {f.name}" for f in functions if f.end_lineno - f.lineno >= 80]
+    assert not long
