@@ -153,11 +153,6 @@ test_prb_edge.py::test_forward_and_backward_agree[vertices
 test_prb_edge.py::test_gradients_add_to_what_is_there
 test_prb_edge.py::test_other_variants_agree_with_rgb
 test_prb_edge.py::test_terms_add_up[vertices-False]
-test_random_scenes.py::test_agrees_with_finite_differences[17]
-test_random_scenes.py::test_agrees_with_finite_differences[36]
-test_random_scenes.py::test_agrees_with_finite_differences[44]
-test_random_scenes.py::test_agrees_with_finite_differences[48]
-test_random_scenes.py::test_agrees_with_finite_differences[9]
 test_reflectance.py::test_dictionary_of_the_package
 test_reflectance.py::test_reduction_finds_the_lobes_of_the_tables
 test_reflectance.py::test_reduction_keeps_few_alphas_and_etas

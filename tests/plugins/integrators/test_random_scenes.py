@@ -12,7 +12,7 @@ import pytest
 from random_scenes import STAGES, Comparison, compare, make, statistics
 
 #: With lamps, textures, environment maps and lenses among them; each takes a few seconds.
-FEW = (5, 9, 17, 30, 36, 44, 48, 83)
+FEW = (5, 30, 83, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (9, 17, 36, 44, 48)))
 SEEDS = range(int(os.environ["RIMLIGHT_SCENES"])) if "RIMLIGHT_SCENES" in os.environ else FEW
 
 
