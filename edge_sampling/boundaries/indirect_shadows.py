@@ -14,25 +14,45 @@ divided between the two: see `share`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.choice.sampling import Reservoir
 from rimlight.edge_sampling.choice.silhouettes import Placement
 from rimlight.edge_sampling.geometry.meshes import is_smooth
 from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.rays import spawn_ray_to
 
-from .shadow_boundary import SeenShadow, ShadowBoundary, fall, thrown
+from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow, ShadowBoundary, fall, thrown
 from .tracer import ShadingPoint, Tracer
 
+#: Shadows of which one is kept, in proportion to what it contributes if nothing hides it.
+CANDIDATES = 2
 
-def share(point: ShadingPoint, density: mi.Float) -> mi.Float:
-    """Part of the shadows of lamps that is found from the lamps, as far as a vertex of a path and the one before are
-    concerned: the less, the more likely these two find each other, since they are close, or since one is glossy.
+#: How little likely an edge that hides a lamp from a point is found from the lamp: its density there, by angle, is
+#: about one over this.
+AROUND = 0.4
 
-    density : by area, with which one is found from the other by sampling the BSDF.
+
+def share(
+    density: mi.Float, light_pdf: mi.Float, pdf: mi.Float, cos: mi.Float, near: mi.Float, whole: mi.Float
+) -> mi.Float:
+    """Part of the shadows of lamps that is found from the lamps: the balance heuristic (Veach 1997) for the density of
+    the place x of the shadow, by area, and of the point of the edge, by length.
+
+    From the lamp, a point of it is chosen, then an edge, and x is behind that. From the vertex before, x is sampled by
+    the BSDF; then an edge in the directions of the lamp, or of the highlight, if that is smaller.
+
+    density : of x by area as it is sampled from the vertex before. light_pdf, pdf : of the direction from x to the
+    lamp, among light samples and among those of the BSDF. cos : of the angle between it and the normal at x. near,
+    whole : distances of the edge and of the lamp from x.
     """
-    return dr.rcp(1 + dr.square(density * dr.square(point.vicinity.radius)))
+    from_lamp = light_pdf * cos * (whole - near) * dr.rsqrt(light_pdf + pdf) / (AROUND * dr.square(whole) * near)
+    part = from_lamp / (from_lamp + density)
+    return dr.select(dr.isfinite(part) & dr.isfinite(density), part, 0)
 
 
 def is_bent(lamp: mi.Shape) -> bool:
@@ -57,8 +77,7 @@ class IndirectShadows(ShadowBoundary):
         """
         scene, z = tracer.scene, point.si
         with dr.suspend_grad():
-            light = self._point_on_light(scene, choice * len(self), z.time, sampler)
-            edge = self._edge(placement, light, sampler)
+            light, edge = self._chosen(scene, placement, point, sampler, choice)
             shadow = fall(scene, light, edge)
 
             # ---------------------- From the point to the shadow ----------------------
@@ -75,17 +94,18 @@ class IndirectShadows(ShadowBoundary):
             active &= dr.any(f != 0)
             active &= ~scene.ray_test(spawn_ray_to(scene, z, si.p), active)
             cos_over_r2 = dr.abs_dot(si.n, ω) / r2
-            ours = dr.select(light.on_surface, share(point, pdf * cos_over_r2), 1)
+            near, whole = dr.norm(edge.p - si.p), dr.norm(light.y - si.p)
+            ours = partial(share, pdf * cos_over_r2, cos=dr.abs_dot(si.n, edge.ω), near=near, whole=whole)
             ray = mi.RayDifferential3f(shadow.ray)
             ray.wavelengths = z.wavelengths
-            weight = f * dr.select(active, cos_over_r2 * ours, 0)
+            weight = f * dr.select(active, cos_over_r2, 0)
             view = SeenShadow(mi.Point2f(0), ray, weight, shadow.fallen, si, None, active)
-            met, jump, active = self._arriving(scene, light, edge, shadow, view, share=True)
+            met, jump, active = self._arriving(scene, light, edge, shadow, view, ours)
 
             # ---------------------- The boundary on the surface ----------------------
 
             tangent, towards_light = (thrown(v, light, edge, shadow) for v in (edge.tangent, edge.lit))
-            n_dl = dr.cross(shadow.facing, tangent) * (len(self) / (edge.sample.density * light.density))
+            n_dl = dr.cross(shadow.facing, tangent) * (len(self) / edge.sample.density)
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl = dr.select(active, n_dl, 0)
@@ -98,3 +118,50 @@ class IndirectShadows(ShadowBoundary):
             held = dr.lerp(slid, m, far)
             moved = (x - dr.detach(x)) - (held - dr.detach(held))
             return jump * dr.dot(n_dl, dr.select(active, moved, 0))
+
+    def _chosen(
+        self, scene: mi.Scene, placement: Placement, point: ShadingPoint, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[LightPoint, LitEdge]:
+        """Of a few shadows one. The density of its edge is what an unbiased estimate divides by, that of the point on
+        the light included."""
+        z, active = point.si, mi.Bool(point.active)
+
+        def look(k, on_light, reservoir, sampler):
+            at = _OnLight((choice + k) * (len(self) / CANDIDATES), sampler.next_2d())
+            light = self._point_on_light(scene, at.choice, z.time, at.numbers)
+            edge = self._edge(placement, light, sampler)
+            target = self._unshadowed(z, light, edge, fall(scene, light, edge), active)
+            edge.sample.density *= light.density
+            reservoir, taken = reservoir.take(edge.sample, target, sampler, active)
+            return k + 1, dr.select(taken, at, on_light), reservoir, sampler
+
+        width = dr.width(active)
+        _, at, reservoir, _ = dr.while_loop(
+            (dr.zeros(mi.Float, width), dr.zeros(_OnLight, width), dr.zeros(Reservoir, width), sampler),
+            lambda k, *_: active & (k < CANDIDATES),
+            look,
+            label="shadows",
+        )
+        light = self._point_on_light(scene, at.choice, z.time, at.numbers)
+        return light, self._edge_at(placement, light, reservoir.kept(CANDIDATES))
+
+    @staticmethod
+    def _unshadowed(z, light: LightPoint, edge: LitEdge, shadow: Shadow, active: mi.Bool) -> mi.Float:
+        """About what a shadow does to the light of a point, if nothing hides it, and all surfaces are equal."""
+        active = active & shadow.active
+        d = shadow.x - z.p
+        r2 = dr.squared_norm(d)
+        ω = d * dr.rsqrt(r2)
+        f = dr.max(z.bsdf().eval(mi.BSDFContext(), z, z.to_local(ω), active))
+        along = dr.norm(dr.cross(shadow.facing, thrown(edge.tangent, light, edge, shadow)))
+        lit = dr.abs_dot(shadow.facing, edge.ω) * dr.select(light.on_surface, dr.abs_dot(light.n, edge.ω), 1)
+        lit *= dr.rcp(dr.select(light.far, 1, dr.squared_norm(shadow.x - light.y)))
+        return dr.select(active, f * dr.abs_dot(shadow.facing, ω) / r2 * along * lit, 0)
+
+
+@dataclass
+class _OnLight:
+    """The random numbers of a point on a light."""
+
+    choice: mi.Float
+    numbers: mi.Point2f

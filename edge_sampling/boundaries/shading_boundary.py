@@ -18,13 +18,16 @@ finds the shadows of small lights, is divided as between the sampling of lights 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
-from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic, resample
+from rimlight.edge_sampling.choice.sampling import EdgeSample, Reservoir, power_heuristic
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
-from rimlight.edge_sampling.choice.views import Lobe, View
+from rimlight.edge_sampling.choice.views import Cone, Lobe, View
 from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals
 from rimlight.edge_sampling.parametrisation import Vicinity, material_point
 from rimlight.edge_sampling.rays import spawn_ray
@@ -37,8 +40,12 @@ from .tracer import ShadingPoint, Tracer
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
 
-#: Part of the samples that are for emitted light, where scattered light counts, too.
+#: Part of the samples that are for emitted light, where both kinds of light may come past an edge.
 EMISSION = 2 / 3
+
+#: How much to prefer edges that stand still, for scattered light at points that stand still: they count only where what
+#: is seen past them moves.
+STILL = 0.2
 
 #: Edges from which one is kept, in proportion to what it contributes if nothing hides it.
 CANDIDATES = 4
@@ -123,17 +130,12 @@ class ShadingBoundary:
 
             # ---------------------- Emitted light, or scattered ----------------------
 
-            emission = ((point.depth != 1) | self.emission_at_first) & self.emission
-            scattering = mi.Bool(tracer.scatters(point.depth + 1)) & tracer.scatters(2)
-            active &= emission | scattering
-            # Emitted light is sought in the directions of one light, scattered light everywhere.
-            p = dr.select(emission, dr.select(scattering, EMISSION, 1), 0)
-            emission = sampler.next_1d(active) < p
+            emission = active & ((point.depth != 1) | self.emission_at_first) & self.emission
+            scattering = active & tracer.scatters(point.depth + 1) & tracer.scatters(2)
             facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
-            light, p_light = self._choose(tracer, si.p, facing, sampler, active)
+            light, p_light = self._choose(tracer, si.p, facing, sampler, emission)
             cone = self.boxes.cone(light, si.p)
-            cone.cos = dr.select(emission, cone.cos, -1)
-            light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), light, active)
+            light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), light, emission)
 
             # ---------------------- An edge ----------------------
 
@@ -142,22 +144,27 @@ class ShadingBoundary:
                 facing,
                 dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), dr.inv_pi, 0.1 * dr.inv_pi),
                 [self._lobe(si, bsdf, sampler, active)] if self.glossy else [],
-                cone,
             )
-            # Of what scatters light, both sides of each edge count close by.
-            vicinity = Vicinity(dr.select(emission, 0, point.vicinity.around(bsdf).radius))
-            if tracer.scatters(2):
-                view.vicinity = vicinity
-            # What is seen past an edge that stands still may move. What emits does not: else all would be in one group.
-            use = [1, dr.select(moves | point.slides | ~emission, 1, 0)][: self.silhouettes.groups]
 
-            def draw(k, sampler):
-                part = (choice + k) / CANDIDATES
-                return self.silhouettes.sample(
-                    placement, view, sampler, use, choice=part, from_light=False, active=active
+            radius = point.vicinity.around(bsdf).radius
+
+            def candidate(part, emitted, active, sampler):
+                """An edge for emitted light, which is sought in the directions of one light; or for scattered light,
+                which is sought everywhere, and where both sides of edges close by count. And about what it contributes
+                if nothing hides it."""
+                vicinity = Vicinity(dr.select(emitted, 0, radius))
+                towards = replace(
+                    view,
+                    cone=Cone(cone.axis, dr.select(emitted, cone.cos, -1), cone.sin),
+                    vicinity=vicinity if tracer.scatters(2) else None,
                 )
-
-            def unshadowed(e):
+                # What is seen past an edge that stands still may move. What emits does not: else all would be in one
+                # group.
+                still = dr.select(moves | point.slides, 1, dr.select(emitted, 0, STILL))
+                use = [1, still][: self.silhouettes.groups]
+                e = self.silhouettes.sample(
+                    placement, towards, sampler, use, choice=part, from_light=False, active=active
+                )
                 outline = self.silhouettes.point(placement, e, si.p)
                 d = outline.p - si.p
                 r2 = dr.squared_norm(d)
@@ -165,10 +172,14 @@ class ShadingBoundary:
                 arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
                 seen_past = outline.outward(dr.cross(d, outline.tangent), d) != 0
                 crease = self.silhouettes.crease(e, outline) * (1 - vicinity.far(r2))
-                return dr.max(f) * arc * dr.select(seen_past | outline.is_line, 1, crease)
+                # The closer an edge is, the faster its direction turns: this matters most in the vicinity.
+                turn = dr.select(vicinity.radius > 0, dr.rcp(dr.minimum(dr.sqrt(r2), vicinity.radius)), 1)
+                turn *= self.silhouettes.preferred(e, use)
+                return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
 
-            e = resample(draw, unshadowed, sampler, CANDIDATES, active)
-            e.density *= dr.select(emission, p * p_light, 1 - p)
+            e, emission = _chosen(candidate, choice, emission, scattering, sampler)
+            e.density *= dr.select(emission, p_light, 1)
+            vicinity = Vicinity(dr.select(emission, 0, radius))
         return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, vicinity)
 
     @staticmethod
@@ -249,7 +260,9 @@ class ShadingBoundary:
             active &= ~hidden & (past | own)
             L = mi.Spectrum(0)
             if self.emission:
-                L += self._emitted(tracer, point, ray, y, ω, pdf, active & past & emission, light, ~outline.is_line)
+                L += self._emitted(
+                    tracer, point, y, ω, pdf, distance, active & past & emission, light, ~outline.is_line
+                )
             valid = active & y.is_valid()
             if tracer.scatters(2):
                 again = sampler.clone()
@@ -294,9 +307,11 @@ class ShadingBoundary:
         one = dr.select(sampler.next_1d(active) < 0.5, mi.Float(1), -1)
         return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, 2 * n_dl, n_dl)
 
-    def _emitted(self, tracer, point, ray, y, ω, pdf, active, light: mi.EmitterPtr, found_too: mi.Bool) -> mi.Spectrum:
+    def _emitted(
+        self, tracer, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
+    ) -> mi.Spectrum:
         """Light that one light emits at y towards a point. pdf : density of ω among samples of the BSDF there.
-        found_too : may the edge throw a shadow that is found from the light?"""
+        distance : of the edge. found_too : may the edge throw a shadow that is found from the light?"""
         scene, si = tracer.scene, point.si
         at_first = point.depth == 1
         emitter = y.emitter(scene, active)
@@ -312,11 +327,46 @@ class ShadingBoundary:
         on_smooth = lit & ~shared & self.smooth_lamps.are(y.shape) if len(self.smooth_lamps) else mi.Bool(False)
         light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared | on_smooth)
         mis = power_heuristic(pdf, light_pdf)
-        theirs = (1 - mis) * dr.select(at_first, 1, share(point, point.density))
+        part = share(point.density, light_pdf, pdf, dr.abs_dot(si.n, ω), distance, y.t)
+        theirs = dr.select(at_first, 1 - mis, part)
         L *= dr.select(shared, 1 - theirs, 1)
         if len(self.smooth_lamps):
             L *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
         return L
+
+
+def _chosen(
+    candidate: Callable, choice: mi.Float, emission: mi.Bool, scattering: mi.Bool, sampler: mi.Sampler
+) -> tuple[EdgeSample, mi.Bool]:
+    """Of a few candidates one: for emitted light, or for scattered light. If there are both, a reservoir of each takes
+    half of the candidates, and one of the two is kept. And is it for emitted light?
+
+    candidate : makes one, given a uniform number, the kind of light, and a mask. choice : uniform in [0, 1); the
+    numbers of each kind are stratified by it.
+    """
+    active, half = emission | scattering, CANDIDATES // 2
+    both = emission & scattering
+    count = dr.select(both, mi.Float(half), CANDIDATES)
+
+    def look(k, emitted, scattered, sampler):
+        is_emitted = emission & (~scattering | (k < half))
+        e, target = candidate((choice + dr.select(both, k % half, k)) / count, is_emitted, active, sampler)
+        fuller, _ = dr.select(is_emitted, emitted, scattered).take(e, target, sampler, active)
+        return k + 1, dr.select(is_emitted, fuller, emitted), dr.select(is_emitted, scattered, fuller), sampler
+
+    width = dr.width(active)
+    _, emitted, scattered, _ = dr.while_loop(
+        (dr.zeros(mi.UInt32, width), dr.zeros(Reservoir, width), dr.zeros(Reservoir, width), sampler),
+        lambda k, *_: active & (k < CANDIDATES),
+        look,
+        label="candidates",
+    )
+    p = dr.select(scattered.total > 0, EMISSION, mi.Float(1))
+    p = dr.select(emitted.total > 0, p, 0)
+    for_emission = sampler.next_1d(active) < p
+    e = dr.select(for_emission, emitted, scattered).kept(count)
+    e.density *= dr.select(for_emission, p, 1 - p)
+    return e, for_emission
 
 
 def _look(scene, si, x, p, beside, aside, distance, active):

@@ -15,6 +15,7 @@ The point of the light is a *material point*, as it is for the interior derivati
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -102,11 +103,13 @@ class ShadowBoundary:
         with dr.suspend_grad():
             choice = (dr.arange(mi.Float, count) + sampler.next_1d()) * (len(self) / count)
             time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
-            light = self._point_on_light(tracer.scene, choice, time, sampler)
+            light = self._point_on_light(tracer.scene, choice, time, sampler.next_2d())
             edge = self._edge(placement, light, sampler)
             shadow = fall(tracer.scene, light, edge)
             view = _look(tracer, projection, sensor, sampler, light.time, shadow)
-            met, jump, active = self._arriving(tracer.scene, light, edge, shadow, view, share=share)
+            met, jump, active = self._arriving(
+                tracer.scene, light, edge, shadow, view, power_heuristic if share else None
+            )
 
             # ---------------------- The boundary on the film ----------------------
 
@@ -148,13 +151,12 @@ class ShadowBoundary:
 
     # ---------------------- From a light to an edge ----------------------
 
-    def _point_on_light(self, scene: mi.Scene, choice: mi.Float, time: mi.Float, sampler: mi.Sampler) -> _LightPoint:
-        """choice : uniform from 0 to the number of lights."""
+    def _point_on_light(self, scene: mi.Scene, choice: mi.Float, time: mi.Float, numbers: mi.Point2f) -> LightPoint:
+        """choice : uniform from 0 to the number of lights. numbers : uniform, for the point."""
         which = dr.minimum(mi.UInt32(choice), len(self) - 1)
         choice = dr.clip(choice - which, 0, dr.one_minus_epsilon(mi.Float))
         light = dr.gather(mi.UInt32, self.chosen, which)
         emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.lights.emitter, light))
-        numbers = sampler.next_2d()
         on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
         far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) if self.any_other else mi.Bool(False)
         y, density = mi.Point3f(0), mi.Float(1)
@@ -165,7 +167,7 @@ class ShadowBoundary:
             ps, _ = emitter.sample_position(time, numbers, on_surface)
             y, n = dr.select(on_surface, ps.p, y), dr.select(on_surface, mi.Vector3f(ps.n), 0)
             density = dr.select(on_surface, ps.pdf, 1)
-        return _LightPoint(light, emitter, choice, time, numbers, on_surface, far, y, n, density)
+        return LightPoint(light, emitter, choice, time, numbers, on_surface, far, y, n, density)
 
     def _off_surface(self, scene: mi.Scene, light, far, numbers, active) -> mi.Point3f:
         """Where lights are that are no surfaces; at infinity, in which direction."""
@@ -174,7 +176,7 @@ class ShadowBoundary:
         ds, _ = self.lights.sample_direction(scene, light, it, numbers, active)
         return dr.select(far, mi.Point3f(ds.d), ds.p)
 
-    def _follow(self, scene: mi.Scene, light: _LightPoint, onwards, met, active) -> mi.Point3f:
+    def _follow(self, scene: mi.Scene, light: LightPoint, onwards, met, active) -> mi.Point3f:
         """The point of the light, attached to its motion. onwards, met : a ray that meets it."""
         q = mi.Point3f(0)
         if self.any_other:
@@ -183,7 +185,7 @@ class ShadowBoundary:
             q = dr.select(light.on_surface, material_point(onwards, met, active & light.on_surface).p, q)
         return q
 
-    def _edge(self, placement: Placement, light: _LightPoint, sampler: mi.Sampler) -> _Edge:
+    def _edge(self, placement: Placement, light: LightPoint, sampler: mi.Sampler) -> LitEdge:
         """An edge as the light sees it."""
         silhouettes, far, y = self.silhouettes, light.far, light.y
         eye = dr.select(far, mi.Vector3f(y), mi.Vector3f(y - silhouettes.centre))
@@ -193,21 +195,36 @@ class ShadowBoundary:
         # Shadows of edges that stand still matter only on what moves.
         use = [1, 0.2][: silhouettes.groups]
         e = silhouettes.sample(placement, view, sampler, use, choice=light.choice, from_light=True, active=active)
-        outline = silhouettes.point(placement, e, y, far)
+        return self._edge_at(placement, light, e)
+
+    def _edge_at(self, placement: Placement, light: LightPoint, e: EdgeSample) -> LitEdge:
+        """The point of an edge that was sampled, as the light sees it."""
+        far, y = light.far, light.y
+        outline = self.silhouettes.point(placement, e, y, far)
         d = dr.select(far, -mi.Vector3f(y), outline.p - y)
         ω = dr.normalize(d)
         across = dr.normalize(dr.cross(ω, outline.tangent))
         lit = across * outline.outward(across, ω)
         emits = dr.select(light.on_surface, dr.dot(light.n, ω), 1) > 0
-        return _Edge(e, outline.p, outline.tangent, lit, d, ω, active & (e.density > 0) & emits & dr.any(lit != 0))
+        return LitEdge(e, outline.p, outline.tangent, lit, d, ω, (e.density > 0) & emits & dr.any(lit != 0))
 
     # ---------------------- What arrives where the shadow falls ----------------------
 
     def _arriving(
-        self, scene: mi.Scene, light: _LightPoint, edge: _Edge, shadow: _Shadow, view: SeenShadow, *, share: bool
+        self,
+        scene: mi.Scene,
+        light: LightPoint,
+        edge: LitEdge,
+        shadow: Shadow,
+        view: SeenShadow,
+        share: Callable | None,
     ) -> tuple[mi.PreliminaryIntersection3f, mi.Spectrum, mi.Bool]:
         """What a ray to the light meets; the radiance that the sensor sees of this light beside the shadow, and is it
-        there?"""
+        there?
+
+        share : given the densities of the direction to a lamp, among light samples and those of the BSDF: which part of
+            its shadow is found so; None: all.
+        """
         si, y, n, on_surface = view.si, light.y, light.n, light.on_surface
         # From x to the edge, nothing is in the way: that has been seen already.
         onwards = shadow.onwards
@@ -235,7 +252,7 @@ class ShadowBoundary:
             if share or len(self.smooth_lamps):
                 ds = mi.DirectionSample3f(scene, on_light, si)
                 light_pdf = scene.pdf_emitter_direction(si, ds, emitting)
-                mis = power_heuristic(light_pdf, pdf)
+                mis = (share or power_heuristic)(light_pdf, pdf)
             if len(self.smooth_lamps) and not share:
                 cos, mis = self.smooth_lamps.cosine(on_light, ω_x, mis), 1
             Le = light.emitter.eval(on_light, emitting) * (cos / dr.squared_norm(to_light))
@@ -247,7 +264,7 @@ class ShadowBoundary:
 
 
 @dataclass
-class _LightPoint:
+class LightPoint:
     """A point of a light; at infinity, y is the direction towards it.
 
     n : normal, 0 where the light is no surface. density : of y, by area. choice : what is left of a random number.
@@ -266,7 +283,7 @@ class _LightPoint:
 
 
 @dataclass
-class _Edge:
+class LitEdge:
     """A point p of an edge as the light sees it, with the tangent there.
 
     lit : unit vector across edge and light, towards the lit side. d, ω : from the light to p, ω of unit length.
@@ -282,7 +299,7 @@ class _Edge:
 
 
 @dataclass
-class _Shadow:
+class Shadow:
     """Where the shadow of that point falls.
 
     x : mi.Point3f, a little off the surface. facing : its normal, on the side of the light. lift : how high above it
@@ -313,7 +330,7 @@ class SeenShadow:
     active: mi.Bool
 
 
-def fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
+def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
     p, ω, far = edge.p, edge.ω, light.far
     aside = edge.lit * beside_edge(p, dr.select(far, p, light.y))
     ray = mi.Ray3f(p + aside, ω)
@@ -329,11 +346,11 @@ def fall(scene: mi.Scene, light: _LightPoint, edge: _Edge) -> _Shadow:
     x = mi.Point3f(hit.p - aside - ω * along - facing * lift)
     towards_light = dr.select(far, -ω, dr.normalize(light.y - p - aside))
     onwards = mi.Ray3f(p + aside, towards_light, light.time, ray.wavelengths)
-    return _Shadow(x, facing, lift, fallen.shape, onwards, ray, fallen, active)
+    return Shadow(x, facing, lift, fallen.shape, onwards, ray, fallen, active)
 
 
 def _look(
-    tracer: Tracer, projection: Projection, sensor: mi.Sensor, sampler: mi.Sampler, time: mi.Float, shadow: _Shadow
+    tracer: Tracer, projection: Projection, sensor: mi.Sensor, sampler: mi.Sampler, time: mi.Float, shadow: Shadow
 ) -> SeenShadow:
     """Does the sensor see it?"""
     x = shadow.x
@@ -359,7 +376,7 @@ def _look(
     return SeenShadow(u, ray, weight, seen, si, aperture_sample, active)
 
 
-def thrown(v: mi.Vector3f, light: _LightPoint, edge: _Edge, shadow: _Shadow) -> mi.Vector3f:
+def thrown(v: mi.Vector3f, light: LightPoint, edge: LitEdge, shadow: Shadow) -> mi.Vector3f:
     """How the shadow moves over what it falls on if the point of the edge moves by v."""
     facing, d = shadow.facing, edge.d
     s = dr.select(light.far, 1, dr.dot(facing, shadow.x + facing * shadow.lift - light.y) / dr.dot(facing, d))

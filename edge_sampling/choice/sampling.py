@@ -147,6 +147,34 @@ def _edge_of_the_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Samp
     return EdgeSample(dr.gather(mi.UInt32, tree.slot_edge, slot, alive), t, dr.select(dr.isfinite(density), density, 0))
 
 
+@dataclass
+class Reservoir:
+    """Of several samples one, in proportion to a target over density (Talbot et al. 2005, "Importance Resampling for
+    Global Illumination"). (A Dr.Jit structure: the state of a loop; empty if zero.)
+
+    edge, t : of the one that is kept. target : its own. total : of all, target over density.
+    """
+
+    edge: mi.UInt32
+    t: mi.Float
+    target: mi.Float
+    total: mi.Float
+
+    def take(self, e: EdgeSample, target: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> tuple[Reservoir, mi.Bool]:
+        """With one sample more; and is it this that is kept?"""
+        weight = dr.select(e.density > 0, target / e.density, 0)
+        weight = dr.select(active & dr.isfinite(weight), weight, 0)
+        total = self.total + weight
+        taken = sampler.next_1d(active) * total < weight
+        choose = lambda a, b: dr.select(taken, a, b)
+        return Reservoir(choose(e.edge, self.edge), choose(e.t, self.t), choose(target, self.target), total), taken
+
+    def kept(self, count: mi.Float | int) -> EdgeSample:
+        """The one that is kept, of so many. Its `density` is what an unbiased estimate divides by, though no
+        density."""
+        return EdgeSample(self.edge, self.t, dr.select(self.total > 0, self.target * count / self.total, 0))
+
+
 def resample(
     draw: Callable[[mi.Float, mi.Sampler], EdgeSample],
     target: Callable[[EdgeSample], mi.Float],
@@ -154,36 +182,28 @@ def resample(
     count: int,
     active: mi.Bool,
 ) -> EdgeSample:
-    """Of a few samples keep one, in proportion to `target` over density (Talbot et al. 2005, "Importance Resampling for
-    Global Illumination"): the more there are, the closer the density comes to `target`.
+    """Of a few samples keep one, see `Reservoir`: the more there are, the closer the density comes to `target`.
 
     draw : makes the k-th sample.
     target : of the density with respect to t; 0 only where the integrand is.
 
     Returns
     -------
-    EdgeSample, (N,). Its `density` is what an unbiased estimate divides by, though no density.
+    EdgeSample, (N,), see `Reservoir.kept`.
     """
 
-    def step(k, kept, t, value, total, sampler):
+    def step(k, reservoir, sampler):
         e = draw(k, sampler)
-        new = target(e)
-        weight = dr.select(e.density > 0, new / e.density, 0)
-        weight = dr.select(active & dr.isfinite(weight), weight, 0)
-        total += weight
-        taken = sampler.next_1d(active) * total < weight
-        choose = lambda a, b: dr.select(taken, a, b)
-        return k + 1, choose(e.edge, kept), choose(e.t, t), choose(new, value), total, sampler
+        return k + 1, reservoir.take(e, target(e), sampler, active)[0], sampler
 
     width = dr.width(active)
-    zero = dr.zeros(mi.Float, width)
-    _, edge, t, value, total, _ = dr.while_loop(
-        (mi.Float(zero), dr.zeros(mi.UInt32, width), mi.Float(zero), mi.Float(zero), mi.Float(zero), sampler),
+    _, reservoir, _ = dr.while_loop(
+        (dr.zeros(mi.Float, width), dr.zeros(Reservoir, width), sampler),
         lambda k, *_: active & (k < count),
         step,
         label="candidates",
     )
-    return EdgeSample(edge, t, dr.select(total > 0, value * count / total, 0))
+    return reservoir.kept(count)
 
 
 def _renewed(choice: mi.Float, density: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:

@@ -79,7 +79,7 @@ class Silhouettes:
     Moving edges are a group of their own, so that viewers that stand still need not look at the others.
     """
 
-    _NUMBERS = ("count", "groups", "centre", "_first_line")
+    _NUMBERS = ("count", "groups", "centre", "_first_line", "_still")
     DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
@@ -91,6 +91,7 @@ class Silhouettes:
         moves = np.ones(len(edges), bool)
         if moving is not None:
             moves = edges.is_line | np.array(moving, bool)[edges.mesh].any(axis=1)
+        self._still = mi.Bool(~moves)
         groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         #: Number of groups of edges.
         self.groups = len(groups)
@@ -188,6 +189,13 @@ class Silhouettes:
         first, second = (dr.normalize(n) for n in outline.normals)
         edge = dr.select(sample.edge < self.count, sample.edge, 0)
         return self.tree.device_edges.crease(edge, dr.norm(dr.cross(first, second)))
+
+    def preferred(self, sample: EdgeSample, use: list[mi.Float | float]) -> mi.Float:
+        """How much the group is preferred in which an edge is, see `sample_edge`."""
+        if len(use) < 2:
+            return mi.Float(1)
+        still = (sample.edge < self.count) & dr.gather(mi.Bool, self._still, dr.minimum(sample.edge, self.count - 1))
+        return dr.select(still, use[1], use[0])
 
     def only_bends(self, sample: EdgeSample) -> mi.Bool:
         """Is it on an edge across which nothing differs but the planes of two smooth-shaded faces?"""
