@@ -32,8 +32,7 @@ from .tracer import ShadingPoint, Tracer
 #: Shadows of which one is kept, in proportion to what it contributes if nothing hides it.
 CANDIDATES = 2
 
-#: How little likely an edge that hides a lamp from a point is found from the lamp: its density there, by angle, is
-#: about one over this.
+#: What the estimated density of edges, as they are found from lamps, is divided by: see `share`.
 AROUND = 0.4
 
 
