@@ -93,8 +93,9 @@ class Motion:
     def __str__(self) -> str:
         numbers = lambda a: "(" + ", ".join(f"{x:g}" for x in a) + ")"
         how = f"along {numbers(self.direction)}" if self.rotate is None else f"about {numbers(self.rotate)}"
-        chosen = [] if self.moves is None or self.moves.all() else np.flatnonzero(self.moves)
-        return f"{self.key} {how}" + (f", vertices {', '.join(map(str, chosen))}" if len(chosen) else "")
+        if self.moves is None or self.moves.all():
+            return f"{self.key} {how}"
+        return f"{self.key} {how}, vertices {', '.join(map(str, np.flatnonzero(self.moves)))}"
 
     def apply(self, theta: mi.Float | float) -> None:
         """Set the parameter to p(θ) and update the scene; attached if `theta` is."""
@@ -120,7 +121,9 @@ class Motion:
     def _transform(self, theta: mi.Float) -> mi.AffineTransform4f:
         T = mi.Transform4f
         if self.rotate is None:
+            assert self.direction is not None
             return T().translate(theta * _vector(self.direction))
+        assert self.pivot is not None
         axis, pivot = _vector(self.rotate / np.linalg.norm(self.rotate)), _vector(self.pivot)
         return T().translate(pivot) @ T().rotate(axis, dr.rad2deg(theta)) @ T().translate(-pivot)
 
