@@ -1,4 +1,4 @@
-"""Access to the geometry of a scene. The only module that knows how Mitsuba stores a mesh."""
+"""Access to the geometry of a scene."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ import mitsuba as mi
 import numpy as np
 
 from .curves import CURVES
+from .mesh_arrays import (
+    attribute_names,
+    attribute_of,
+    faces_of,
+    has_normals,
+    has_texcoords,
+    is_moving,
+    normals_of,
+    positions_of,
+    texcoords_of,
+)
 from .parameters import Parameter
 
 #: Interpolated normals are those of a face if the sine of the angle between them is at most so large.
@@ -53,7 +64,7 @@ class Geometry:
 
     def moving(self) -> tuple[bool, ...]:
         """For every mesh, and then for every analytic shape: does it move?"""
-        meshes = tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
+        meshes = tuple(is_moving(m) for m in self.meshes)
         return meshes + tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
 
     def refuse_moving_others(self, changing: list[Parameter], who: str) -> None:
@@ -76,7 +87,7 @@ class Geometry:
 
     def positions(self) -> mi.Float:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
-        positions = _concat([m.vertex_positions_buffer() for m in self.meshes])
+        positions = _concat([positions_of(m) for m in self.meshes])
         if self.lines is None:
             return positions
         return dr.concat([positions, *(dr.ravel(p) for p in self.lines.points(positions))])
@@ -91,27 +102,25 @@ class Geometry:
     def normals(self) -> mi.Float:
         """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Attached."""
         none = lambda count: dr.zeros(mi.Float, 3 * count)
-        normals = [
-            m.vertex_normals_buffer() if has_interpolated_normals(m) else none(m.vertex_count()) for m in self.meshes
-        ]
+        normals = [normals_of(m) if has_interpolated_normals(m) else none(m.vertex_count()) for m in self.meshes]
         return _concat([*normals, none(self.line_vertices)] if self.lines is not None else normals)
 
 
 def faces(mesh: Any) -> np.ndarray:
     """Vertex indices of the triangles of a mesh: (F, 3), uint32, on the host."""
-    return np.array(mesh.faces_buffer()).reshape(-1, 3)
+    return np.array(faces_of(mesh)).reshape(-1, 3)
 
 
 def vertices(mesh: Any) -> np.ndarray:
     """Vertex positions of a mesh: (V, 3), world space, on the host, detached."""
-    return np.array(dr.detach(mesh.vertex_positions_buffer())).reshape(-1, 3)
+    return np.array(dr.detach(positions_of(mesh))).reshape(-1, 3)
 
 
 def texture_coordinates(mesh: Any) -> np.ndarray:
     """Texture coordinates of a mesh: (V, 2), on the host, detached; or (V, 0)."""
-    if not mesh.has_vertex_texcoords():
+    if not has_texcoords(mesh):
         return np.zeros((mesh.vertex_count(), 0), np.float32)
-    return np.array(dr.detach(mesh.vertex_texcoords_buffer())).reshape(-1, 2)
+    return np.array(dr.detach(texcoords_of(mesh))).reshape(-1, 2)
 
 
 def vertex_values(mesh: Any) -> np.ndarray:
@@ -123,13 +132,11 @@ def vertex_values(mesh: Any) -> np.ndarray:
 
 def vertex_attributes(mesh: Any) -> dict[str, mi.Float]:
     """Attributes of the vertices of a mesh, by name: each (K V,), detached."""
-    known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
-    names = [k for k in mi.traverse(mesh).properties if k.startswith("vertex_") and k not in known]
-    return {name: dr.detach(mesh.attribute_buffer(name)) for name in names}
+    return {name: dr.detach(attribute_of(mesh, name)) for name in attribute_names(mesh)}
 
 
 def has_interpolated_normals(mesh: Any) -> bool:
-    return mesh.has_vertex_normals() and not mesh.has_face_normals()
+    return has_normals(mesh) and not mesh.has_face_normals()
 
 
 def is_smooth(mesh: Any) -> bool:
@@ -140,9 +147,9 @@ def is_smooth(mesh: Any) -> bool:
 def bent_faces(mesh: Any) -> mi.Bool:
     """Which faces of a mesh with interpolated normals are shaded with others than their own: (F,), detached. Not those
     of `cube`, whose vertices are split."""
-    p, n = dr.detach(mesh.vertex_positions_buffer()), dr.detach(mesh.vertex_normals_buffer())
+    p, n = dr.detach(positions_of(mesh)), dr.detach(normals_of(mesh))
     face = 3 * dr.arange(mi.UInt32, mesh.face_count())
-    vertices = [dr.gather(mi.UInt32, mesh.faces_buffer(), face + k) for k in range(3)]
+    vertices = [dr.gather(mi.UInt32, faces_of(mesh), face + k) for k in range(3)]
     a, b, c = (dr.gather(mi.Point3f, p, v) for v in vertices)
     own = dr.cross(b - a, c - a)
     bent = mi.Bool(False)
@@ -157,12 +164,12 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     """Does something jump wherever two faces of the mesh meet? Attributes of faces; textures without texture
     coordinates, for which the place inside of its own triangle stands; and what depends on the tangents of a face:
     anisotropic materials, bump and normal maps."""
-    if any(k.startswith("face_") for k in mi.traverse(mesh).properties):
+    if attribute_names(mesh, "face_"):
         return True
     objects = list(objects_below(mesh).values())
     if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or is_map(o)) for o in objects):
         return True
-    return not mesh.has_vertex_texcoords() and any(has_place(o) for o in objects)
+    return not has_texcoords(mesh) and any(has_place(o) for o in objects)
 
 
 def bends_light(shape: Any) -> bool:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import no_collection
+from rimlight.edge_sampling.geometry.mesh_arrays import is_positions_key
 
 
 class Motion:
@@ -50,7 +51,7 @@ class Motion:
             raise ValueError(f'"{key}": give either a direction or an axis to rotate about')
         value = self.params[key]
         self.key = key
-        self.is_positions = key.endswith("vertex_positions")
+        self.is_positions = is_positions_key(key)
         self.is_transform = key.endswith("to_world")
         self.is_tensor = dr.is_tensor_v(value)
         if not (self.is_positions or self.is_transform or dr.is_float_v(value)):
@@ -101,10 +102,10 @@ class Motion:
         """Set the parameter to p(θ) and update the scene; attached if `theta` is."""
         theta = mi.Float(theta)
         if self.is_positions:
-            p = dr.unravel(mi.Point3f, self.initial)
+            p = dr.unravel(mi.Point3f, self.initial.array if self.is_tensor else self.initial)
             moved = self._transform(theta) @ p
-            moved = dr.select(mi.Float(self.moves) > 0, moved, p)
-            value = dr.ravel(moved)
+            moved = dr.ravel(dr.select(mi.Float(self.moves) > 0, moved, p))
+            value = type(self.initial)(moved, self.initial.shape) if self.is_tensor else moved
         elif self.is_transform:
             value = self._transform(theta) @ self.initial
         else:

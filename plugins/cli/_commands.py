@@ -15,6 +15,7 @@ from tyro.conf import UseAppendAction, arg
 import rimlight
 from rimlight import pictures
 from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
+from rimlight.edge_sampling.geometry.mesh_arrays import is_positions_key
 from rimlight.exr import write_exr
 from rimlight.loading import InputError, expected, load_integrator, use_variant
 
@@ -69,7 +70,7 @@ class PlanCommand(OnSensor):
         keys = list(self.param) or [
             key
             for key, _, _ in _loading.differentiable(scene)
-            if key.endswith("vertex_positions") or key == _loading.camera_key(scene, self.sensor)
+            if is_positions_key(key) or key == _loading.camera_key(scene, self.sensor)
         ]
         with expected(ValueError, RuntimeError, pattern=REFUSAL):
             print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
