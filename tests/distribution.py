@@ -49,7 +49,7 @@ def build(out: Path) -> tuple[Path, Path]:
 
 
 def normalise(archive: Path, epoch: int) -> None:
-    """Sort the entries of an archive, and give all of them one time and no owner: setuptools keeps those of the disk."""
+    """Sort the entries of an archive, and give all of them one time and no owner: setuptools does not."""
     with tarfile.open(archive) as old:
         entries = [(e, old.extractfile(e).read() if e.isfile() else b"") for e in old.getmembers()]
     with (
