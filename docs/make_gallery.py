@@ -1,8 +1,8 @@
 """Make the gallery of the documentation:  python docs/make_gallery.py [NAME ...]
 
 Writes docs/gallery.md, and for each of ENTRIES a picture in docs/images/gallery: the image, its derivative by Rimlight,
-and the same derivative by finite differences. About twelve minutes on two cores. Names make these entries alone anew.
-Numbers and settings of all are kept in docs/images/gallery/gallery.json.
+and the same derivative by finite differences. About twelve minutes on two cores. Numbers and settings are kept in
+docs/images/gallery/gallery.json: entries that it has are not made again, unless their names are given.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ ENTRIES = [
         "two_triangles",
         "The light moves to the side",
         "Nothing that the camera sees moves. The brightness of the surfaces changes smoothly.",
-        moves("light.vertex_positions", 1, 0, 0),
+        moves("light.to_world", 1, 0, 0),
         5e-3,
     ),
     Entry(
@@ -139,7 +139,7 @@ ENTRIES = [
         "shadow_blocker",
         "The light moves to the side",
         "The shadow moves the other way.",
-        moves("light.vertex_positions", 1, 0, 0),
+        moves("light.to_world", 1, 0, 0),
     ),
     Entry(
         "textured_gloss_box",
@@ -167,7 +167,7 @@ ENTRIES = [
         "glossy_receiver",
         "The light moves to the side",
         "The reflection of the light moves in the floor.",
-        moves("light.vertex_positions", 1, 0, 0),
+        moves("light.to_world", 1, 0, 0),
     ),
     Entry(
         "mirrored_plane",
@@ -202,7 +202,7 @@ ENTRIES = [
         "objects",
         "The light moves to the side",
         "The borders of the soft shadows slide.",
-        moves("light.vertex_positions", 1, 0, 0),
+        moves("light.to_world", 1, 0, 0),
     ),
     Entry(
         "objects_colour",
@@ -233,7 +233,7 @@ ENTRIES = [
         "lit_room",
         "The lamp moves to the side",
         "All soft shadows slide.",
-        moves("lamp.vertex_positions", 1, 0, 0),
+        moves("lamp.to_world", 1, 0, 0),
         integrator=PATH,
     ),
     Entry(
@@ -309,8 +309,8 @@ def text(numbers: dict[str, dict[str, Any]], commit: str) -> str:
         "by Rimlight, and the same derivative by finite differences. Red pixels get brighter, and blue pixels get "
         "darker. Both derivatives share one scale.",
         "",
-        "The **error** is the {term}`relative L1 error` against the finite differences. The **noise** is the error that "
-        "an exact derivative would show, since both sides are Monte Carlo estimates. Where error and noise are equal, "
+        "The **error** is the {term}`relative L1 error` against the finite differences. The **noise** is the error "
+        "that an exact derivative would show, since both sides are Monte Carlo estimates. Where both are equal, "
         "no error is seen. "
         f"Films have {RES} × {RES} pixels. A derivative is the mean of {SEEDS} renders of {SPP} samples per pixel. "
         f"Finite differences are the mean of {RUNS} runs of {REFERENCE_SPP} samples per pixel. "
@@ -343,7 +343,7 @@ def main(names: list[str]) -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     numbers = json.loads(NUMBERS.read_text("utf-8")) if NUMBERS.exists() else {}
     for entry in ENTRIES:
-        if not names or entry.name in names:
+        if entry.name in names or (not names and entry.name not in numbers):
             numbers[entry.name] = make(entry)
             with replacing(NUMBERS) as temporary:
                 temporary.write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")

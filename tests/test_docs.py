@@ -22,9 +22,13 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
 
 BLOCK = re.compile(
-    r"(?P<skip><!-- skip: [^>]+-->\s*)?^(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)^ *```$",
+    r"(?P<skip><!-- skip: [^>]+-->\s*)?^(?P<indent> *)```(?P<language>\w+|\{code-cell\})\n(?::tags: [^\n]*\n)?"
+    r"(?P<code>.*?)^ *```$",
     re.DOTALL | re.MULTILINE,
 )
+
+#: A part of a notebook. A page with such parts has no other Python.
+CELL = "{code-cell}"
 
 #: What precedes the blocks of a page: warnings are errors here, too.
 PROLOGUE = "import warnings\nwarnings.simplefilter('error')\n"
@@ -55,7 +59,7 @@ def program(page: Path, found: list[Block]) -> str:
     """The Python and XML blocks of a page as one program, in one namespace. Errors name the lines of the page."""
     parts = [PROLOGUE]
     for block in found:
-        if block.language == "python":
+        if block.language in ("python", CELL):
             code = "\n" * (block.line - 1) + block.code
             parts.append(f"exec(compile({code!r}, {str(page)!r}, 'exec'))")
         elif block.language == "xml":
@@ -74,7 +78,7 @@ def read(page: Path) -> str:
     return page.read_text(encoding="utf-8")
 
 
-PROGRAMS = [p for p in PAGES if any(b.language in ("python", "xml") for b in blocks(read(p)))]
+PROGRAMS = [p for p in PAGES if any(b.language in ("python", CELL, "xml") for b in blocks(read(p)))]
 COMMANDS = sorted({line for page in PAGES for line in commands(read(page))})
 
 
@@ -125,9 +129,18 @@ def test_links_lead_somewhere(page):
     text = re.sub(r"```(?:python|xml|sh).*?```", "", read(page), flags=re.DOTALL)
     targets = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
     targets += re.findall(r"^```\{(?:include|image)\} (\S+)", text, re.MULTILINE)
-    targets += [f"{name}.md" for name in re.findall(r"\{doc\}`(\w+)`", text)]
     missing = [target for target in targets if not (page.parent / target).exists()]
+    documents = re.findall(r"\{doc\}`(?:[^`<]*<)?([\w/.]+)>?`", text)
+    missing += [d for d in documents if not any((page.parent / f"{d}.{end}").exists() for end in ("md", "rst"))]
     assert not missing
+
+
+def test_notebooks_open_with_their_picture_and_say_their_time():
+    notebooks = sorted((ROOT / "docs" / "notebooks").glob("*.md"))
+    assert len(notebooks) >= 3
+    for page in notebooks:
+        start, _, _ = read(page).partition("```{code-cell}")
+        assert "```{glue:figure} result\n:alt: " in start and "{glue:text}`seconds:.0f` seconds" in start, page
 
 
 def test_there_is_something_to_test():
@@ -144,6 +157,7 @@ def test_blocks_are_found():
         "```{eval-rst}\nno code\n```\n"
     )
     assert blocks(text) == [Block("python", "a = 1\n", 2), Block("sh", "rimlight demo\n", 8)]
+    assert blocks("```{code-cell}\n:tags: [remove-output]\na = 1\n```\n") == [Block(CELL, "a = 1\n", 3)]
     assert commands(text) == ["rimlight demo"]
 
 
