@@ -43,7 +43,11 @@ NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illuminati
 bench: setup
 	for name in $(NAME); do $(BIN)/python tests/benchmarks/bm_$$name.py || exit 1; done
 
-docs: setup
+DEMO := docs/_build/extra/demo/index.html
+$(DEMO): inverse/demo.py $(STAMP)
+	$(BIN)/python -m rimlight demo --out $(@D)
+
+docs: setup $(DEMO)
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 lint: setup

@@ -39,6 +39,8 @@ bibtex_reference_style = "author_year"
 
 html_theme = "furo"
 html_theme_options = {"sidebar_hide_name": False}
+# The demo, as `make docs` has made it
+html_extra_path = [str(p) for p in [Path(__file__).parent / "_build" / "extra"] if p.is_dir()]
 html_show_sphinx = html_show_copyright = False
 exclude_patterns = ["_build", "performance/*"]  # tables that index pages include
 math_eqref_format = "({number})"
