@@ -103,10 +103,11 @@ def check(python: str, wheel: Path, archive: Path) -> None:
         readme = (tree / "README.md").read_text("utf-8")
         printed = run(own, "-c", ten_lines(readme), cwd=empty)
         assert "nan" not in printed and printed.strip(), f"the ten lines printed {printed!r}"
+        assert (empty / "cube.png").stat().st_size, "the ten lines wrote no picture"
         place = run(own, "-c", "import rimlight; print(rimlight.__file__)", cwd=empty)
         assert str(folder / "env") in place, f"rimlight was imported from {place}"
         run(folder / "env" / "bin" / "rimlight", "sys-info", cwd=empty)
-        print(f"{version}: the wheel works, the ten lines print a gradient", flush=True)
+        print(f"{version}: the wheel works, the ten lines write a picture and print a gradient", flush=True)
 
         run(own, "-m", "pip", "install", "--quiet", f"{wheel}[{EXTRAS}]", cwd=folder)
         # Neither the tests' own folder nor the checkout may be found as the package: it has another name there
