@@ -73,7 +73,7 @@ ENTRIES = [
         "cube_closer",
         "cube",
         "The cube comes closer",
-        "All faces have the same brightness. The derivative is not zero on the outline alone.",
+        "All faces have the same brightness. Only the outline has a derivative.",
         moves("cube.vertex_positions", 0, 0, 1),
         5e-3,
     ),
@@ -102,7 +102,7 @@ ENTRIES = [
         "two_triangles_green",
         "two_triangles",
         "The right vertex of the green triangle moves left",
-        "Only the two edges that end in this vertex sweep over the image.",
+        "Only one edge sweeps over the image: the upper edge slides along itself.",
         moves("green.vertex_positions", 1, 0, 0, vertices=[0]),
     ),
     Entry(
@@ -116,7 +116,7 @@ ENTRIES = [
         "two_triangles_light",
         "two_triangles",
         "The light moves to the side",
-        "Nothing that the camera sees moves. The brightness of the surfaces changes smoothly.",
+        "The brightness changes smoothly, and the shadow of the green triangle slides over the red one.",
         moves("light.to_world", 1, 0, 0),
         5e-3,
     ),
@@ -166,7 +166,7 @@ ENTRIES = [
         "glossy_receiver_rough",
         "glossy_receiver",
         "The light moves to the side",
-        "The reflection of the light moves in the floor.",
+        "The reflection of the light moves in the floor. Inside of it, our derivative is noisy.",
         moves("light.to_world", 1, 0, 0),
     ),
     Entry(
@@ -293,13 +293,20 @@ def make(entry: Entry) -> dict[str, Any]:
         "motion": str(motion),
         "integrator": entry.integrator["type"],
         "seconds": round(time.perf_counter() - start, 1),
+        "commit": commit(),
     }
     print(f"{entry.name}: {found}", flush=True)
     return found
 
 
-def text(numbers: dict[str, dict[str, Any]], commit: str) -> str:
+def commit() -> str:
+    command = ["git", "-C", str(DOCS), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def text(numbers: dict[str, dict[str, Any]]) -> str:
     """The page."""
+    commits = sorted({n["commit"] for n in numbers.values()})
     lines = [
         "# Gallery",
         "",
@@ -314,7 +321,7 @@ def text(numbers: dict[str, dict[str, Any]], commit: str) -> str:
         "no error is seen. "
         f"Films have {RES} × {RES} pixels. A derivative is the mean of {SEEDS} renders of {SPP} samples per pixel. "
         f"Finite differences are the mean of {RUNS} runs of {REFERENCE_SPP} samples per pixel. "
-        f"`python docs/make_gallery.py` made them at commit {commit}.",
+        f"`python docs/make_gallery.py` made them at commit {', '.join(commits)}.",
     ]
     last = None
     for entry in ENTRIES:
@@ -348,9 +355,7 @@ def main(names: list[str]) -> None:
             with replacing(NUMBERS) as temporary:
                 temporary.write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
     if all(e.name in numbers for e in ENTRIES):
-        command = ["git", "-C", str(DOCS), "rev-parse", "--short", "HEAD"]
-        commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-        (DOCS / "gallery.md").write_text(text(numbers, commit), "utf-8")
+        (DOCS / "gallery.md").write_text(text(numbers), "utf-8")
 
 
 if __name__ == "__main__":

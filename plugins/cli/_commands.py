@@ -309,9 +309,14 @@ class _Ps:
     """Photometric stereo: find shape and reflectance from images under many lights."""
 
 
+@dataclass(frozen=True)
+class _Bench:
+    """Compare speed and error with Mitsuba's own integrators on this machine. Takes about five minutes."""
+
+
 def commands(argv: Sequence[str]) -> dict[str, type]:
     """Commands by their names. argv : for one whose options depend on a file that they name."""
-    fit, reproduce, reflectance, ps = _Fit, _Reproduce, _Reflectance, _Ps
+    fit, reproduce, reflectance, ps, bench = _Fit, _Reproduce, _Reflectance, _Ps, _Bench
     if argv[:1] in (["fit"], ["reproduce"]):
         from . import _fit  # only now, since it imports much
 
@@ -320,6 +325,8 @@ def commands(argv: Sequence[str]) -> dict[str, type]:
         from ._reflectance import Reflectance as reflectance
     if argv[:1] == ["ps"]:
         from ._ps import Ps as ps
+    if argv[:1] == ["bench"]:
+        from ._bench import Bench as bench
     return {
         "sys-info": SysInfo,
         "params": Params,
@@ -332,5 +339,6 @@ def commands(argv: Sequence[str]) -> dict[str, type]:
         "reproduce": reproduce,
         "reflectance": reflectance,
         "ps": ps,
+        "bench": bench,
         "demo": Demo,
     }
