@@ -15,8 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.mesh_arrays import normals_of
-from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, vertices
+from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, normals_of, vertices
 
 #: How far the cosine between the normals of faces and vertices may be below 1.
 FINE = 0.002

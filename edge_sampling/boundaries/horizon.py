@@ -26,8 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.geometry.device_edges import rounding
-from rimlight.edge_sampling.geometry.mesh_arrays import is_flipped
-from rimlight.edge_sampling.geometry.meshes import Geometry, is_smooth
+from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
 
 #: Cosine to the viewer of a normal just beside the horizon.
 BESIDE_HORIZON = 1e-4

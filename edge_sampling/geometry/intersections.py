@@ -20,8 +20,7 @@ import numpy as np
 
 from .device_edges import rounding
 from .edges import EdgeKind, Edges, Weld
-from .mesh_arrays import positions_of
-from .meshes import Geometry
+from .meshes import Geometry, positions_of
 
 #: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
 IN_ONE_PLANE = 1e-4

@@ -17,14 +17,19 @@ import numpy as np
 
 from .beams import BEAMS, border_values, has_hard_beam
 from .edges import Edges, Weld
-from .mesh_arrays import attribute_of, faces_of, has_texcoords, normals_of, positions_of, texcoords_of
 from .meshes import (
     Geometry,
+    attribute_of,
     bent_faces,
+    faces_of,
     has_interpolated_normals,
     has_place,
+    has_texcoords,
     is_smooth,
+    normals_of,
     objects_below,
+    positions_of,
+    texcoords_of,
     vertex_attributes,
 )
 from .parameters import Parameter

@@ -5,8 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .mesh_arrays import has_texcoords, is_flipped
-from .meshes import has_interpolated_normals, objects_below
+from .meshes import has_interpolated_normals, has_texcoords, is_flipped, objects_below
 
 
 class Surfaces:

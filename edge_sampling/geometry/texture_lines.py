@@ -17,8 +17,7 @@ import numpy as np
 
 from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
 from .mapped_horizons import mapped_horizons
-from .mesh_arrays import has_texcoords
-from .meshes import Geometry, has_place, objects_below, texture_coordinates
+from .meshes import Geometry, has_place, has_texcoords, objects_below, texture_coordinates
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import no_collection
-from rimlight.edge_sampling.geometry.mesh_arrays import is_positions_key
+from rimlight.edge_sampling.geometry.meshes import is_positions_key
 
 
 class Motion:

@@ -15,7 +15,7 @@ from tyro.conf import UseAppendAction, arg
 import rimlight
 from rimlight import pictures
 from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
-from rimlight.edge_sampling.geometry.mesh_arrays import is_positions_key
+from rimlight.edge_sampling.geometry.meshes import is_positions_key
 from rimlight.exr import write_exr
 from rimlight.loading import InputError, expected, load_integrator, use_variant
 

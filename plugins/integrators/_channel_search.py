@@ -10,7 +10,7 @@ import numpy as np
 from rimlight.edge_sampling import Edges, FilmBoundary, jumping_textures
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.geometry.edges import EdgeKind
-from rimlight.edge_sampling.geometry.mesh_arrays import has_texcoords
+from rimlight.edge_sampling.geometry.meshes import has_texcoords
 from rimlight.transport.channels import LABELS, OF_TRIANGLES, Channel
 from rimlight.transport.paths import Depths
 

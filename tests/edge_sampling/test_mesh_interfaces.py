@@ -9,7 +9,7 @@ import pytest
 
 from rimlight.checks import Motion
 from rimlight.edge_sampling import Geometry, find_edges
-from rimlight.edge_sampling.geometry import mesh_arrays, meshes
+from rimlight.edge_sampling.geometry import meshes
 
 
 class Tensors:
@@ -140,7 +140,7 @@ def test_gradients_of_shared_positions_add_up(variant):
     ],
 )
 def test_keys_of_positions(key, expected):
-    assert mesh_arrays.is_positions_key(key) is expected
+    assert meshes.is_positions_key(key) is expected
 
 
 def test_motions_of_tensors_are_those_of_flat_arrays(variant, monkeypatch):
