@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
+import json
 import re
 import shlex
 import subprocess
@@ -15,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight import merl_tables
+from rimlight import merl_tables, scenes
 from rimlight._registration import plugin_modules
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -167,3 +169,16 @@ def test_a_failing_snippet_is_noticed(tmp_path):
     result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True)
     assert result.returncode != 0
     assert f'{page}", line 7' in result.stderr
+
+
+def test_the_gallery_shows_every_scene():
+    """Shipped scenes, with a picture of each entry; and the page is what `docs/make_gallery.py` writes."""
+    specification = importlib.util.spec_from_file_location("make_gallery", ROOT / "docs" / "make_gallery.py")
+    gallery = importlib.util.module_from_spec(specification)
+    sys.modules["make_gallery"] = gallery  # data classes look there
+    specification.loader.exec_module(gallery)
+    numbers = json.loads(gallery.NUMBERS.read_text("utf-8"))
+    assert (ROOT / "docs" / "gallery.md").read_text("utf-8") == gallery.text(numbers)
+    assert {*scenes.names(), "room", "traffic_sign"} == {entry.scene for entry in gallery.ENTRIES}
+    assert len(gallery.ENTRIES) >= 20
+    assert {f"{entry.name}.webp" for entry in gallery.ENTRIES} == {p.name for p in gallery.FOLDER.glob("*.webp")}
