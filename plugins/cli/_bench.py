@@ -27,7 +27,7 @@ from ._shared import progress, writing
 RES = 32
 
 #: Runs and samples per pixel of the finite differences.
-RUNS, REFERENCE_SPP = 8, 1024
+RUNS, REFERENCE_SPP = 8, 8192
 
 #: Fewest and most calls of a method after the first.
 CALLS = 3, 64
@@ -77,6 +77,7 @@ class Row:
     calls : after the first. first, seconds : time of the first call, and the median of the others.
     error, interval : relative L1 error of single derivatives, mean and half of its interval of 95 % confidence.
     of_mean : relative L1 error of the mean of all calls: bias, and the rest of the noise.
+    noise : relative L1 error that the noise of the reference alone would cause.
     efficiency : 1 / (MSE · s), without the noise of the reference.
     """
 
@@ -89,6 +90,7 @@ class Row:
     error: float
     interval: float
     of_mean: float
+    noise: float
     efficiency: float
 
 
@@ -100,7 +102,7 @@ class Bench:
     """JSON file to write, to share or to compare. The table is printed."""
     spp: int = 16
     """Samples per pixel of a derivative."""
-    seconds: float = 12
+    seconds: float = 8
     """Time for the calls of one method in one scene."""
 
     def run(self) -> int:
@@ -170,6 +172,7 @@ def row(
         error=float(errors.mean()),
         interval=float(CONFIDENCE * errors.std(ddof=1) / np.sqrt(len(errors))),
         of_mean=float(np.abs(images.mean(0) - reference.mean).sum() / size),
+        noise=float(np.sqrt(2 / np.pi) * reference.standard_error.sum() / size),
         efficiency=float(1 / (max(squared, 0) * seconds)) if squared > 0 else float("inf"),
     )
 
@@ -177,14 +180,23 @@ def row(
 def table(rows: list[Row]) -> list[str]:
     """Lines of Markdown."""
     lines = [
-        "| scene | method | first call, s | median, s | rel. L1 error | of the mean | efficiency, ours = 1 |",
-        "|---|---|---:|---:|---:|---:|---:|",
+        "| scene | method | first call, s | median, s | rel. L1 | of the mean | of the reference | efficiency, ours = 1 |",
+        "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     ours = {r.scene: r.efficiency for r in rows if r.options["type"] == "direct_edge"}
     for r in rows:
         tuned = ", ".join(f"{k} {v}" for k, v in r.options.items() if k != "type")
         name = r.method + (f" ({tuned})" if tuned else "")
         error, gain = f"{r.error:.1%} ± {r.interval:.1%}", r.efficiency / ours[r.scene]
-        cells = (r.scene, name, f"{r.first:.2f}", f"{r.seconds:.4f}", error, f"{r.of_mean:.1%}", f"{gain:.2g}")
+        cells = (
+            r.scene,
+            name,
+            f"{r.first:.2f}",
+            f"{r.seconds:.4f}",
+            error,
+            f"{r.of_mean:.1%}",
+            f"{r.noise:.1%}",
+            f"{gain:.2g}",
+        )
         lines.append(f"| {' | '.join(cells)} |")
     return lines
