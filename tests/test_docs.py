@@ -145,6 +145,15 @@ def test_notebooks_open_with_their_picture_and_say_their_time():
         assert "```{glue:figure} result\n:alt: " in start and "{glue:text}`seconds:.0f` seconds" in start, page
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_pictures_have_alternatives(page):
+    """For those who cannot see them: a text in the brackets, or the option `alt`."""
+    text = re.sub(r"```(?:python|xml|sh).*?```", "", read(page), flags=re.DOTALL)
+    assert not [target for alt, target in re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", text) if not alt.strip()]
+    options = re.findall(r"^```\{(?:image|figure|glue:figure)\}[^\n]*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    assert all(re.search(r"^:alt: \S", block, re.MULTILINE) for block in options)
+
+
 def test_there_is_something_to_test():
     assert {"README.md", "getting_started.md", "extending.md"} <= {p.name for p in PROGRAMS}
     assert any(b.language == "xml" for b in blocks(read(ROOT / "README.md")))
