@@ -56,3 +56,13 @@ def test_it_writes_a_table_and_a_file(tmp_path, monkeypatch, capsys):
 def test_bad_options(options, tmp_path, capsys):
     assert main(["bench", "--out", str(tmp_path / "bench.json"), *options]) == 2
     assert capsys.readouterr().err.startswith("rimlight: error: --")
+
+
+def test_methods_that_are_better_than_the_reference_have_an_efficiency():
+    """Where the derivative is less noisy than the reference, and without bias, its variance counts."""
+    rng = np.random.default_rng(1)
+    noisy = FiniteDifferences(
+        (1 + rng.normal(0, 0.1, (4, 4, 3))).astype(np.float32), np.full((4, 4, 3), 0.2, np.float32), np.zeros(0), {}
+    )
+    row = _bench.row("cube", "m", {"type": "m"}, 1 + rng.normal(0, 0.01, (50, 4, 4, 3)), [1.0] * 51, noisy)
+    assert row.efficiency == pytest.approx(1 / 0.01**2, rel=0.1)
