@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: setup demo test test-fast test-full mutants bench docs lint clean
+.PHONY: setup demo test test-fast test-full mutants bench docs lint dist clean
 
 setup: $(STAMP)
 
@@ -43,13 +43,26 @@ NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illuminati
 bench: setup
 	for name in $(NAME); do $(BIN)/python tests/benchmarks/bm_$$name.py || exit 1; done
 
-docs: setup
+DEMO := docs/_build/extra/demo/index.html
+$(DEMO): inverse/demo.py $(STAMP)
+	$(BIN)/python -m rimlight demo --out $(@D)
+
+docs: setup $(DEMO)
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
+	rm -rf build/types && mkdir -p build/types/rimlight
+	ln -s $(CURDIR)/plugins/* $(CURDIR)/edge_sampling $(CURDIR)/inverse $(CURDIR)/scenes build/types/rimlight
+	$(BIN)/mypy
+
+# A wheel and an archive of the sources, in dist/; then the wheel alone, in an empty environment of each Python
+PYTHONS ?= python3
+dist: setup
+	$(BIN)/python tests/distribution.py $(PYTHONS)
 
 clean:
-	rm -rf $(VENV) build dist demo docs/_build .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) build dist demo docs/_build .mypy_cache .pytest_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -16,7 +16,7 @@ release = version = rimlight.__version__
 html_title = f"Rimlight {version}"
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx_inline_tabs",
@@ -26,12 +26,21 @@ extensions = [
 ]
 myst_enable_extensions = ["amsmath", "deflist", "dollarmath"]
 myst_heading_anchors = 3
+# Notebooks run when they, or the packages of this environment, have changed: `make clean` forgets their results
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(Path(__file__).parent / "_build" / ".jupyter_cache")
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
 bibtex_bibfiles = ["references.bib"]
 bibtex_default_style = "plain"
 bibtex_reference_style = "author_year"
 
 html_theme = "furo"
 html_theme_options = {"sidebar_hide_name": False}
+# The demo, as `make docs` has made it
+html_extra_path = [str(p) for p in [Path(__file__).parent / "_build" / "extra"] if p.is_dir()]
 html_show_sphinx = html_show_copyright = False
 exclude_patterns = ["_build", "performance/*"]  # tables that index pages include
 math_eqref_format = "({number})"

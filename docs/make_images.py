@@ -1,8 +1,8 @@
 """Make the pictures of the README and the documentation:  python docs/make_images.py [FOLDER]
 
-About seven minutes on two cores. Writes docs/images/overview.png; normal_integration.png, which needs the depth of the
-bear of DiLiGenT in ../shared; adversarial.png, which needs the extra `adversarial`; and reflectance.png, if the
-argument names a folder with tables of the MERL database.
+About eight minutes on two cores. Writes docs/images/without.webp, an animation; overview.png; normal_integration.png,
+which needs the depth of the bear of DiLiGenT in ../shared; adversarial.png, which needs the extra `adversarial`; and
+reflectance.png, if the argument names a folder with tables of the MERL database.
 """
 
 from __future__ import annotations
@@ -28,6 +28,49 @@ SPP, LAUNCHES = 64, 128
 
 #: Step (scene units; half of it counts), runs and samples per pixel of the finite differences.
 STEP, RUNS, REFERENCE_SPP = 2e-3, 8, 1024
+
+
+def without(path: Path) -> None:
+    """An animation: a cube looks for its place in an image, by the gradient of `prb`, and by that of `prb_edge`."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    from rimlight import no_collection, pictures, scenes
+
+    key, size, top, gap, steps = "cube.vertex_positions", 176, 26, 8, 48
+    scene = mi.load_file(str(scenes.path("objects")), res=size // 2)
+    large = mi.load_file(str(scenes.path("objects")), res=size)
+    params, shown = mi.traverse(scene), mi.traverse(large)
+    initial = dr.unravel(mi.Point3f, mi.Float(params[key]))
+    target = mi.TensorXf(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=256))
+    view = lambda: pictures.to_srgb(mi.render(large, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=64))
+    goal, films = view(), {}
+    for name in ("prb", "prb_edge"):
+        integrator = mi.load_dict({"type": name, "max_depth": 2})
+        optimiser = mi.ad.Adam(lr=0.03)
+        optimiser["shift"] = mi.Vector3f(-0.35, 0.35, 0.3)
+        films[name] = []
+        for i in range(steps):
+            with no_collection():
+                params[key] = dr.ravel(initial + optimiser["shift"])
+                params.update()
+                if i % 2 == 0:
+                    shown[key] = dr.detach(params[key])
+                    shown.update()
+                    films[name].append(view())
+                image = mi.render(scene, params, integrator=integrator, spp=16, seed=2 * i, seed_grad=2 * i + 1)
+                dr.backward(dr.mean(dr.square(image - target), axis=None))
+                optimiser.step()
+        print(f"{name}: {optimiser['shift']}")
+    frames, font = [], ImageFont.load_default(13)
+    for wrong, right in zip(films["prb"], films["prb_edge"], strict=True):
+        frame = Image.new("RGB", (3 * size + 2 * gap, size + top), "white")
+        captions = ("without the boundary term", "with it: Rimlight", "the target")
+        for k, (panel, caption) in enumerate(zip((wrong, right, goal), captions, strict=True)):
+            frame.paste(Image.fromarray(panel), (k * (size + gap), top))
+            ImageDraw.Draw(frame).text((k * (size + gap) + 2, 5), caption, fill="black", font=font)
+        frames.append(frame)
+    durations = [1000, *[90] * (len(frames) - 2), 2500]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, quality=70, method=6)
 
 
 def overview(path: Path) -> None:
@@ -157,6 +200,7 @@ if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     IMAGES.mkdir(exist_ok=True)
+    without(IMAGES / "without.webp")
     overview(IMAGES / "overview.png")
     normal_integration(IMAGES / "normal_integration.png")
     adversarial(IMAGES / "adversarial.png")

@@ -214,9 +214,11 @@ class Run:
         self.plan = [*explored, *map(Segment, problem.stage[1:])]
         self.total = sum(segment.stage.iterations for segment in self.plan)
         self.progress = Progress()
-        if tensorboard and self.file is None:
-            raise ValueError("fit: to write a log for TensorBoard, name a folder")
-        self._board = _board(self.file.parent) if tensorboard else None
+        self._board = None
+        if tensorboard:
+            if self.file is None:
+                raise ValueError("fit: to write a log for TensorBoard, name a folder")
+            self._board = _board(self.file.parent)
         self._stop = False
         self._disk_failed = False
         if resume:
@@ -275,7 +277,7 @@ class Run:
         ]
         found = self.executor(values, tasks)
         loss = float(np.mean([f.loss for f in found]))
-        gradients = {
+        gradients: dict[str, Any] = {
             key: sum((f.gradients[key] for f in found if key in f.gradients), np.float32(0)) / len(found)
             for key in values
         }

@@ -51,15 +51,14 @@ def value_and_gradient(
         share = A @ share @ B.T
         level = np.einsum("ih,hwc,jw->ijc", down, difference, across, optimize=True)
         known = np.maximum(share, 1e-12)[..., None]
-        norm = "l1" if loss.norm == "l1" else "l2"
-        v, g = _at_one_level(Loss(norm=norm), level / known, 0 * level, share)
+        v, g = _at_one_level(Loss(norm="l1" if loss.norm == "l1" else "l2"), level / known, 0 * level, share)
         value += v
         back = np.einsum("ih,ijc,jw->hwc", down, g / known, across, optimize=True) * weight[..., None]
         gradient += back / np.sqrt(np.square(target) + FLOOR) if loss.norm == "relative" else back
     return value / (loss.pyramid + 1), gradient / (loss.pyramid + 1)
 
 
-def _at_one_level(loss: Loss, image, target, weight) -> tuple[float, np.ndarray]:
+def _at_one_level(loss: Loss, image: np.ndarray, target: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
     d = image - target
     share = weight[..., None] / max(weight.sum() * image.shape[2], 1e-12)
     if loss.norm == "l1":

@@ -60,7 +60,9 @@ class Optimiser:
         dr.eval(found)
         for name, gradient in found.items():
             inner = self.inner[name]
-            dr.set_grad(inner[name], gradient if self.clip is None else self._clipped(name, np.array(gradient)))
+            dr.set_grad(
+                inner[name], gradient if self.clip is None else self._clipped(name, np.array(gradient), self.clip)
+            )
             inner.set_learning_rate({name: self.rates[name] * factor})
         for inner in self.used:
             inner.step()
@@ -71,9 +73,9 @@ class Optimiser:
                 self.inner[name][name] = _own(legal)
                 self.latents()[name] = legal
 
-    def _clipped(self, name: str, gradient: np.ndarray) -> mi.Float:
+    def _clipped(self, name: str, gradient: np.ndarray, clip: float) -> mi.Float:
         length, known = float(np.linalg.norm(gradient)), self.lengths[name]
-        longest = self.clip * float(np.median(known)) if known else length
+        longest = clip * float(np.median(known)) if known else length
         known.append(length)
         del known[:-REMEMBERED]
         return mi.Float(gradient * (min(1, longest / length) if length > 0 else 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -249,7 +250,8 @@ def _check_classifier(problem: Problem) -> None:
     for label, number in named:
         if not 0 <= number < CLASSES:
             raise InputError(f'fit: the class "{label}" must have a number 0 … {CLASSES - 1}, got {number}')
-    for what, given in (("label", [label for label, _ in named]), ("class", [number for _, number in named])):
+    for what, column in (("label", 0), ("class", 1)):
+        given = [pair[column] for pair in named]
         if twice := {x for x in given if given.count(x) > 1}:
             raise InputError(f'fit: loss.rise and loss.fall name the {what} "{twice.pop()}" twice')
     for name in ("pyramid", "exclude_above"):
@@ -261,7 +263,7 @@ def _check_classifier(problem: Problem) -> None:
                 raise InputError(f'fit: target.{i}.{name}: with the norm "classifier" there is nothing to compare with')
 
 
-def _at_least(where: str, of: Any, minima: dict[str, float]) -> None:
+def _at_least(where: str, of: Any, minima: Mapping[str, float]) -> None:
     for name, minimum in minima.items():
         value = getattr(of, name)
         if value is not None and not value >= minimum:
@@ -367,7 +369,7 @@ def relative_to(problem: Problem, folder: Path) -> Problem:
     targets = tuple(
         dataclasses.replace(t, file=place(t.file), scene=place(t.scene), mask=place(t.mask)) for t in problem.target
     )
-    return dataclasses.replace(problem, scene=place(problem.scene), target=targets)
+    return dataclasses.replace(problem, scene=(folder / problem.scene).resolve(), target=targets)
 
 
 def _without_none(value: Any) -> Any:

@@ -65,7 +65,7 @@ def write(folder: Path, fit: Fit, *, title: str) -> None:
     with replacing(folder / "result.json") as temporary:
         temporary.write_text(fitting.summary(fit) + "\n", "utf-8")
     with replacing(folder / "result.npz") as temporary:
-        np.savez(temporary, **fit.values)
+        np.savez(temporary, **fit.values)  # type: ignore[arg-type]
     problems.write(folder / "problem.toml", fit.problem)
     for i, view in enumerate(fit.views):
         for name, image in (("start", view.start), ("result", view.result), ("target", view.target)):
@@ -195,8 +195,8 @@ def _parameters(fit: Fit) -> str:
     sections = ['<section>\n<h2>Parameters</h2>\n<div class="row">']
     if fit.errors:
         ratio = lambda e: number(e[-1] / e[0], 2) if e[0] else "–"
-        rows = [(label, number(e[0]), number(e[-1]), ratio(e)) for label, e in fit.errors.items()]
-        shown = page.table(("error", "start", "result", "ratio"), rows, "Distance from the truth")
+        errors = [(label, number(e[0]), number(e[-1]), ratio(e)) for label, e in fit.errors.items()]
+        shown = page.table(("error", "start", "result", "ratio"), errors, "Distance from the truth")
         sections.append(f"<div>\n<h3>Distance from the truth</h3>\n{shown}\n</div>")
     rows = [(_latent_name(fit, name), *_numbers(fit, name)) for name in fit.latents]
     shown = page.table(("parameter", "start", "result"), rows, "Values of the parameters")

@@ -21,7 +21,7 @@ import drjit as dr
 class _Collector:
     """Python's garbage collector, off while anybody needs that: it is one for all threads."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.lock = threading.Lock()
         self.guards = 0
         self.enabled = False

@@ -46,7 +46,7 @@ class Lobes:
     #: Index of refraction, above 1, or NaN.
     eta: tuple[float, ...]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.alpha) != len(self.eta) or not self.alpha:
             raise ValueError(
                 f'"alpha" and "eta" must have a number for each lobe, got {len(self.alpha)} and {len(self.eta)}'

@@ -37,7 +37,7 @@ class Led:
     #: Radiant intensity on the axis, linear sRGB. At least 0.
     intensity: tuple[float, float, float]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for column, value in zip(COLUMNS, self.row(), strict=True):
             if not math.isfinite(value):
                 raise ValueError(f'column "{column}": expected a finite number, got {value}')

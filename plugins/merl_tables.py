@@ -146,6 +146,5 @@ def directions(theta_h: np.ndarray, theta_d: np.ndarray, phi_d: np.ndarray) -> t
     theta_h, theta_d, phi_d = np.broadcast_arrays(theta_h, theta_d, phi_d)
     along, x, y = np.cos(theta_d), np.sin(theta_d) * np.cos(phi_d), np.sin(theta_d) * np.sin(phi_d)
     sin, cos = np.sin(theta_h), np.cos(theta_h)
-    return tuple(
-        np.stack([sin * along + sign * cos * x, sign * y, cos * along - sign * sin * x], -1) for sign in (1, -1)
-    )
+    wi, wo = (np.stack([sin * along + sign * cos * x, sign * y, cos * along - sign * sin * x], -1) for sign in (1, -1))
+    return wi, wo

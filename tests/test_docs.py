@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
+import json
 import re
 import shlex
 import subprocess
@@ -15,16 +17,20 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight import merl_tables
+from rimlight import merl_tables, scenes
 from rimlight._registration import plugin_modules
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
 
 BLOCK = re.compile(
-    r"(?P<skip><!-- skip: [^>]+-->\s*)?^(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)^ *```$",
+    r"(?P<skip><!-- skip: [^>]+-->\s*)?^(?P<indent> *)```(?P<language>\w+|\{code-cell\})\n(?::tags: [^\n]*\n)?"
+    r"(?P<code>.*?)^ *```$",
     re.DOTALL | re.MULTILINE,
 )
+
+#: A part of a notebook. A page with such parts has no other Python.
+CELL = "{code-cell}"
 
 #: What precedes the blocks of a page: warnings are errors here, too.
 PROLOGUE = "import warnings\nwarnings.simplefilter('error')\n"
@@ -55,7 +61,7 @@ def program(page: Path, found: list[Block]) -> str:
     """The Python and XML blocks of a page as one program, in one namespace. Errors name the lines of the page."""
     parts = [PROLOGUE]
     for block in found:
-        if block.language == "python":
+        if block.language in ("python", CELL):
             code = "\n" * (block.line - 1) + block.code
             parts.append(f"exec(compile({code!r}, {str(page)!r}, 'exec'))")
         elif block.language == "xml":
@@ -74,7 +80,7 @@ def read(page: Path) -> str:
     return page.read_text(encoding="utf-8")
 
 
-PROGRAMS = [p for p in PAGES if any(b.language in ("python", "xml") for b in blocks(read(p)))]
+PROGRAMS = [p for p in PAGES if any(b.language in ("python", CELL, "xml") for b in blocks(read(p)))]
 COMMANDS = sorted({line for page in PAGES for line in commands(read(page))})
 
 
@@ -125,9 +131,27 @@ def test_links_lead_somewhere(page):
     text = re.sub(r"```(?:python|xml|sh).*?```", "", read(page), flags=re.DOTALL)
     targets = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
     targets += re.findall(r"^```\{(?:include|image)\} (\S+)", text, re.MULTILINE)
-    targets += [f"{name}.md" for name in re.findall(r"\{doc\}`(\w+)`", text)]
     missing = [target for target in targets if not (page.parent / target).exists()]
+    documents = re.findall(r"\{doc\}`(?:[^`<]*<)?([\w/.]+)>?`", text)
+    missing += [d for d in documents if not any((page.parent / f"{d}.{end}").exists() for end in ("md", "rst"))]
     assert not missing
+
+
+def test_notebooks_open_with_their_picture_and_say_their_time():
+    notebooks = sorted((ROOT / "docs" / "notebooks").glob("*.md"))
+    assert len(notebooks) >= 3
+    for page in notebooks:
+        start, _, _ = read(page).partition("```{code-cell}")
+        assert "```{glue:figure} result\n:alt: " in start and "{glue:text}`seconds:.0f` seconds" in start, page
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_pictures_have_alternatives(page):
+    """For those who cannot see them: a text in the brackets, or the option `alt`."""
+    text = re.sub(r"```(?:python|xml|sh).*?```", "", read(page), flags=re.DOTALL)
+    assert not [target for alt, target in re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", text) if not alt.strip()]
+    options = re.findall(r"^```\{(?:image|figure|glue:figure)\}[^\n]*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    assert all(re.search(r"^:alt: \S", block, re.MULTILINE) for block in options)
 
 
 def test_there_is_something_to_test():
@@ -144,6 +168,7 @@ def test_blocks_are_found():
         "```{eval-rst}\nno code\n```\n"
     )
     assert blocks(text) == [Block("python", "a = 1\n", 2), Block("sh", "rimlight demo\n", 8)]
+    assert blocks("```{code-cell}\n:tags: [remove-output]\na = 1\n```\n") == [Block(CELL, "a = 1\n", 3)]
     assert commands(text) == ["rimlight demo"]
 
 
@@ -153,3 +178,16 @@ def test_a_failing_snippet_is_noticed(tmp_path):
     result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True)
     assert result.returncode != 0
     assert f'{page}", line 7' in result.stderr
+
+
+def test_the_gallery_shows_every_scene():
+    """Shipped scenes, with a picture of each entry; and the page is what `docs/make_gallery.py` writes."""
+    specification = importlib.util.spec_from_file_location("make_gallery", ROOT / "docs" / "make_gallery.py")
+    gallery = importlib.util.module_from_spec(specification)
+    sys.modules["make_gallery"] = gallery  # data classes look there
+    specification.loader.exec_module(gallery)
+    numbers = json.loads(gallery.NUMBERS.read_text("utf-8"))
+    assert (ROOT / "docs" / "gallery.md").read_text("utf-8") == gallery.text(numbers)
+    assert {*scenes.names(), "room", "traffic_sign"} == {entry.scene for entry in gallery.ENTRIES}
+    assert len(gallery.ENTRIES) >= 20
+    assert {f"{entry.name}.webp" for entry in gallery.ENTRIES} == {p.name for p in gallery.FOLDER.glob("*.webp")}

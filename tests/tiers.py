@@ -75,8 +75,15 @@ test_distant_lights.py::test_derivatives_of_images[angular_radius
 test_distant_lights.py::test_derivatives_of_images[background.value-diffuse]
 test_distant_lights.py::test_derivatives_of_images[directions-diffuse]
 test_distant_lights.py::test_derivatives_of_images[irradiance
+test_docs.py::test_snippets_run[bowl_under_many_lights.md]
+test_docs.py::test_snippets_run[camera_calibration.md]
+test_docs.py::test_snippets_run[check_any_gradient.md]
 test_docs.py::test_snippets_run[fits.md]
+test_docs.py::test_snippets_run[object_in_a_mirror.md]
 test_docs.py::test_snippets_run[photometric_stereo.md]
+test_docs.py::test_snippets_run[pose_from_photo.md]
+test_docs.py::test_snippets_run[room_materials.md]
+test_docs.py::test_snippets_run[shape_from_shadows.md]
 test_fine_meshes.py::test_glass[alone]
 test_fine_meshes.py::test_light_of_coarse_lamps_backward
 test_fine_meshes.py::test_outlines_count_once

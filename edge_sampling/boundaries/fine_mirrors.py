@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, vertices
+from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, normals_of, vertices
 
 #: How far the cosine between the normals of faces and vertices may be below 1.
 FINE = 0.002
@@ -55,7 +55,7 @@ def fringe(shape: mi.Shape) -> float:
     """How far the cosine between the normals of faces and vertices is below 1, at most; 0 without interpolated ones."""
     if not shape.is_mesh() or not has_interpolated_normals(shape):
         return 0.0
-    corners, normals = faces(shape), np.array(dr.detach(shape.vertex_normals_buffer())).reshape(-1, 3)
+    corners, normals = faces(shape), np.array(dr.detach(normals_of(shape))).reshape(-1, 3)
     p = vertices(shape)[corners].astype(np.float64)
     flat = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None]
     n = normals[corners]

@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.geometry.device_edges import rounding
-from rimlight.edge_sampling.geometry.meshes import Geometry, is_smooth
+from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
 
 #: Cosine to the viewer of a normal just beside the horizon.
 BESIDE_HORIZON = 1e-4
@@ -82,7 +82,7 @@ class Horizons:
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
         meshes = [m for m, s in zip(geometry.meshes, smooth, strict=True) if s]
         signs = [
-            np.full(m.vertex_count(), (-1 if m.has_flipped_normals() else 1) if s else 0, np.float32)
+            np.full(m.vertex_count(), (-1 if is_flipped(m) else 1) if s else 0, np.float32)
             for m, s in zip(geometry.meshes, smooth, strict=True)
         ]
         signs.append(np.zeros(geometry.line_vertices, np.float32))

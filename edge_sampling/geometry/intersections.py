@@ -20,7 +20,7 @@ import numpy as np
 
 from .device_edges import rounding
 from .edges import EdgeKind, Edges, Weld
-from .meshes import Geometry
+from .meshes import Geometry, positions_of
 
 #: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
 IN_ONE_PLANE = 1e-4
@@ -91,7 +91,7 @@ class Intersections:
     def find(self, scene: mi.Scene, geometry: Geometry) -> bool:
         """Find the pairs of triangles, as the meshes are now; return whether there is now more space for them, or
         other meshes may cut each other. On the host, and reads from the device: not in frozen functions."""
-        arrays = [dr.detach(m.vertex_positions_buffer()) for m in geometry.meshes]
+        arrays = [dr.detach(positions_of(m)) for m in geometry.meshes]
         if self._at is not None and all(a.index == b.index for a, b in zip(arrays, self._at, strict=True)):
             return False
         self._at = arrays

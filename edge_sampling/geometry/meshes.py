@@ -1,4 +1,10 @@
-"""Access to the geometry of a scene. The only module that knows how Mitsuba stores a mesh."""
+"""Access to the geometry of a scene. The only module that knows how Mitsuba stores a mesh.
+
+All else sees the arrays of a mesh flat, with one entry for each vertex. Mitsuba 3.9 keeps them so. Mitsuba 3.10 keeps
+tensors, `positions` of shape (P, 3) and `normals` of shape (N, 3), with P <= N <= V for V vertices: vertices that
+differ in their texture coordinates only share a position. The maps `position_index` and `normal_index` lead from a
+vertex to its position and normal; an empty map is the identity (release notes of Mitsuba 3.10).
+"""
 
 from __future__ import annotations
 
@@ -14,6 +20,9 @@ from .parameters import Parameter
 
 #: Interpolated normals are those of a face if the sine of the angle between them is at most so large.
 BENT = 1e-3
+
+#: A method of the meshes of Mitsuba 3.9, which those of 3.10 do not have.
+OLD = "vertex_positions_buffer"
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,7 @@ class Geometry:
 
     def moving(self) -> tuple[bool, ...]:
         """For every mesh, and then for every analytic shape: does it move?"""
-        meshes = tuple(dr.grad_enabled(m.vertex_positions_buffer()) for m in self.meshes)
+        meshes = tuple(is_moving(m) for m in self.meshes)
         return meshes + tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
 
     def refuse_moving_others(self, changing: list[Parameter], who: str) -> None:
@@ -76,7 +85,7 @@ class Geometry:
 
     def positions(self) -> mi.Float:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
-        positions = _concat([m.vertex_positions_buffer() for m in self.meshes])
+        positions = _concat([positions_of(m) for m in self.meshes])
         if self.lines is None:
             return positions
         return dr.concat([positions, *(dr.ravel(p) for p in self.lines.points(positions))])
@@ -91,27 +100,100 @@ class Geometry:
     def normals(self) -> mi.Float:
         """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Attached."""
         none = lambda count: dr.zeros(mi.Float, 3 * count)
-        normals = [
-            m.vertex_normals_buffer() if has_interpolated_normals(m) else none(m.vertex_count()) for m in self.meshes
-        ]
+        normals = [normals_of(m) if has_interpolated_normals(m) else none(m.vertex_count()) for m in self.meshes]
         return _concat([*normals, none(self.line_vertices)] if self.lines is not None else normals)
+
+
+# ---------------------- Arrays, in both interfaces; attached where those of the mesh are ----------------------
+
+
+def positions_of(mesh: Any) -> mi.Float:
+    """Positions of the vertices: (3 V,), world space, scene units."""
+    if hasattr(mesh, OLD):
+        return mesh.vertex_positions_buffer()
+    return _of_vertices(mesh.positions(), mesh.position_index())
+
+
+def normals_of(mesh: Any) -> mi.Float:
+    """Normals of the vertices: (3 V,), world space. They need not have the length 1."""
+    if hasattr(mesh, OLD):
+        return mesh.vertex_normals_buffer()
+    return _of_vertices(mesh.normals(), mesh.normal_index())
+
+
+def texcoords_of(mesh: Any) -> mi.Float:
+    """Texture coordinates of the vertices: (2 V,)."""
+    return mesh.vertex_texcoords_buffer() if hasattr(mesh, OLD) else mesh.texcoords().array
+
+
+def faces_of(mesh: Any) -> mi.UInt32:
+    """Vertices of the triangles: (3 F,)."""
+    return mesh.faces_buffer() if hasattr(mesh, OLD) else mi.UInt32(mesh.faces().array)
+
+
+def attribute_of(mesh: Any, name: str) -> mi.Float:
+    """An attribute of the vertices or faces: (K V,) or (K F,)."""
+    return mesh.attribute_buffer(name) if hasattr(mesh, OLD) else mesh.attribute(name).array
+
+
+def has_normals(mesh: Any) -> bool:
+    """Does the mesh store normals of its vertices?"""
+    return mesh.has_vertex_normals() if hasattr(mesh, OLD) else mesh.has_normals()
+
+
+def has_texcoords(mesh: Any) -> bool:
+    """Does the mesh store texture coordinates?"""
+    return mesh.has_vertex_texcoords() if hasattr(mesh, OLD) else mesh.has_texcoords()
+
+
+def is_flipped(mesh: Any) -> bool:
+    """Do normals point against the side that the order of the vertices makes the front? Never in Mitsuba 3.10, which
+    turns the faces round."""
+    return mesh.has_flipped_normals() if hasattr(mesh, OLD) else False
+
+
+def is_moving(mesh: Any) -> bool:
+    """Do the positions carry a gradient?"""
+    return dr.grad_enabled(mesh.vertex_positions_buffer() if hasattr(mesh, OLD) else mesh.positions())
+
+
+def is_positions_key(key: str) -> bool:
+    """Does a parameter of a scene hold the positions of a mesh? ``vertex_positions``, (3 V,), or since Mitsuba 3.10
+    ``positions``, (P, 3)."""
+    return key.rpartition(".")[2] in ("vertex_positions", "positions")
+
+
+def attribute_names(mesh: Any, of: str = "vertex_") -> list[str]:
+    """Names of the attributes of the vertices, or ``face_`` of the faces."""
+    known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+    return [name for name in mi.traverse(mesh).properties if name.startswith(of) and name not in known]
+
+
+def _of_vertices(values: mi.TensorXf, index: mi.UInt32) -> mi.Float:
+    """(3 V,) of the rows (P, 3) that `index` names."""
+    if dr.width(index) == 0:
+        return values.array
+    return dr.ravel(dr.gather(mi.Point3f, values.array, index))
+
+
+# ---------------------- What meshes are like ----------------------
 
 
 def faces(mesh: Any) -> np.ndarray:
     """Vertex indices of the triangles of a mesh: (F, 3), uint32, on the host."""
-    return np.array(mesh.faces_buffer()).reshape(-1, 3)
+    return np.array(faces_of(mesh)).reshape(-1, 3)
 
 
 def vertices(mesh: Any) -> np.ndarray:
     """Vertex positions of a mesh: (V, 3), world space, on the host, detached."""
-    return np.array(dr.detach(mesh.vertex_positions_buffer())).reshape(-1, 3)
+    return np.array(dr.detach(positions_of(mesh))).reshape(-1, 3)
 
 
 def texture_coordinates(mesh: Any) -> np.ndarray:
     """Texture coordinates of a mesh: (V, 2), on the host, detached; or (V, 0)."""
-    if not mesh.has_vertex_texcoords():
+    if not has_texcoords(mesh):
         return np.zeros((mesh.vertex_count(), 0), np.float32)
-    return np.array(dr.detach(mesh.vertex_texcoords_buffer())).reshape(-1, 2)
+    return np.array(dr.detach(texcoords_of(mesh))).reshape(-1, 2)
 
 
 def vertex_values(mesh: Any) -> np.ndarray:
@@ -123,13 +205,11 @@ def vertex_values(mesh: Any) -> np.ndarray:
 
 def vertex_attributes(mesh: Any) -> dict[str, mi.Float]:
     """Attributes of the vertices of a mesh, by name: each (K V,), detached."""
-    known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
-    names = [k for k in mi.traverse(mesh).properties if k.startswith("vertex_") and k not in known]
-    return {name: dr.detach(mesh.attribute_buffer(name)) for name in names}
+    return {name: dr.detach(attribute_of(mesh, name)) for name in attribute_names(mesh)}
 
 
 def has_interpolated_normals(mesh: Any) -> bool:
-    return mesh.has_vertex_normals() and not mesh.has_face_normals()
+    return has_normals(mesh) and not mesh.has_face_normals()
 
 
 def is_smooth(mesh: Any) -> bool:
@@ -140,9 +220,9 @@ def is_smooth(mesh: Any) -> bool:
 def bent_faces(mesh: Any) -> mi.Bool:
     """Which faces of a mesh with interpolated normals are shaded with others than their own: (F,), detached. Not those
     of `cube`, whose vertices are split."""
-    p, n = dr.detach(mesh.vertex_positions_buffer()), dr.detach(mesh.vertex_normals_buffer())
+    p, n = dr.detach(positions_of(mesh)), dr.detach(normals_of(mesh))
     face = 3 * dr.arange(mi.UInt32, mesh.face_count())
-    vertices = [dr.gather(mi.UInt32, mesh.faces_buffer(), face + k) for k in range(3)]
+    vertices = [dr.gather(mi.UInt32, faces_of(mesh), face + k) for k in range(3)]
     a, b, c = (dr.gather(mi.Point3f, p, v) for v in vertices)
     own = dr.cross(b - a, c - a)
     bent = mi.Bool(False)
@@ -157,12 +237,12 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     """Does something jump wherever two faces of the mesh meet? Attributes of faces; textures without texture
     coordinates, for which the place inside of its own triangle stands; and what depends on the tangents of a face:
     anisotropic materials, bump and normal maps."""
-    if any(k.startswith("face_") for k in mi.traverse(mesh).properties):
+    if attribute_names(mesh, "face_"):
         return True
     objects = list(objects_below(mesh).values())
     if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or is_map(o)) for o in objects):
         return True
-    return not mesh.has_vertex_texcoords() and any(has_place(o) for o in objects)
+    return not has_texcoords(mesh) and any(has_place(o) for o in objects)
 
 
 def bends_light(shape: Any) -> bool:

@@ -19,11 +19,17 @@ from .beams import BEAMS, border_values, has_hard_beam
 from .edges import Edges, Weld
 from .meshes import (
     Geometry,
+    attribute_of,
     bent_faces,
+    faces_of,
     has_interpolated_normals,
     has_place,
+    has_texcoords,
     is_smooth,
+    normals_of,
     objects_below,
+    positions_of,
+    texcoords_of,
     vertex_attributes,
 )
 from .parameters import Parameter
@@ -134,15 +140,15 @@ class Sources:
         """All arrays that matter, by mesh and name; detached."""
         arrays = {}
         for i, mesh in enumerate(geometry.meshes):
-            arrays[i, "faces"] = mesh.faces_buffer()
-            arrays[i, "positions"] = dr.detach(mesh.vertex_positions_buffer())
+            arrays[i, "faces"] = faces_of(mesh)
+            arrays[i, "positions"] = dr.detach(positions_of(mesh))
             if i in self._flat:
-                arrays[i, "normals"] = dr.detach(mesh.vertex_normals_buffer())
+                arrays[i, "normals"] = dr.detach(normals_of(mesh))
             if i in self._seams:
-                if mesh.has_vertex_texcoords():
-                    arrays[i, "texcoords"] = dr.detach(mesh.vertex_texcoords_buffer())
+                if has_texcoords(mesh):
+                    arrays[i, "texcoords"] = dr.detach(texcoords_of(mesh))
                 for name in self._attributes[i]:
-                    arrays[i, name] = dr.detach(mesh.attribute_buffer(name))
+                    arrays[i, name] = dr.detach(attribute_of(mesh, name))
         return arrays
 
     def _differ(self, mesh: int, values: mi.Float) -> mi.Bool:

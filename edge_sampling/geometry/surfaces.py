@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .meshes import has_interpolated_normals, objects_below
+from .meshes import has_interpolated_normals, has_texcoords, is_flipped, objects_below
 
 
 class Surfaces:
@@ -19,7 +19,7 @@ class Surfaces:
 
     def __init__(self, scene: mi.Scene):
         meshes = [o for o in objects_below(scene).values() if isinstance(o, mi.Mesh) and has_interpolated_normals(o)]
-        self._any_other = any(m.has_vertex_texcoords() or m.has_flipped_normals() for m in meshes)
+        self._any_other = any(has_texcoords(m) or is_flipped(m) for m in meshes)
 
     def met(self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """What a ray meets; dn_du and dn_dv are derivatives with respect to the texture coordinates."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
 from .mapped_horizons import mapped_horizons
-from .meshes import Geometry, has_place, objects_below, texture_coordinates
+from .meshes import Geometry, has_place, has_texcoords, objects_below, texture_coordinates
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _of_beam(light: mi.Emitter) -> list[Any]:
 
 def _matrices(shape: Any) -> list[np.ndarray]:
     """Of the textures of a shape, or of a light, that jump."""
-    of_mesh = isinstance(shape, mi.Mesh) and shape.has_vertex_texcoords()
+    of_mesh = isinstance(shape, mi.Mesh) and has_texcoords(shape)
     uv = np.concatenate([[[0, 0], [1, 1]], texture_coordinates(shape) if of_mesh else np.zeros((0, 2))])
     found = []
     below = objects_below(shape)
@@ -173,7 +173,7 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
     besides : shapes whose textures are not asked for.
     """
     known = [o for s in besides for o in objects_below(s).values()]
-    uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if m.has_vertex_texcoords()]
+    uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if has_texcoords(m)]
     uv = np.concatenate([[[0, 0], [1, 1]], *uv])
     return [
         f'"{name}" ({o.class_name().partition("TextureImpl")[0]})'

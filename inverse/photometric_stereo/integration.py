@@ -21,6 +21,7 @@ With a camera, r = (x, −y, −1); without, r = (0, 0, −1), ∂r/∂u = (`pix
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -159,7 +160,9 @@ class _Equations:
         return np.stack([ahead[self.first], 1 - ahead[self.second]])
 
 
-def _equations(mask, normals, rays, steps, cosine) -> tuple[_Equations, _Equations]:
+def _equations(
+    mask: np.ndarray, normals: np.ndarray, rays: np.ndarray, steps: np.ndarray, cosine: np.ndarray
+) -> tuple[_Equations, ...]:
     """Equations between neighbours in rows, and in columns."""
     index = np.full(mask.shape, -1)
     index[mask] = np.arange(len(normals))
@@ -174,7 +177,7 @@ def _equations(mask, normals, rays, steps, cosine) -> tuple[_Equations, _Equatio
     return tuple(found)
 
 
-def _least_squares(equations, weights, q: np.ndarray) -> np.ndarray:
+def _least_squares(equations: Sequence[_Equations], weights: Sequence[np.ndarray], q: np.ndarray) -> np.ndarray:
     """Least weighted squares of the residuals: normal equations, whose matrix is a Laplacian of the graph of pixels."""
     first, second = (np.concatenate([e.pixels[k] for e in equations]) for k in (0, 1))
     stiffness = np.concatenate([(w * e.slope**2).sum(0) for e, w in zip(equations, weights, strict=True)])

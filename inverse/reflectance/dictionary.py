@@ -154,7 +154,7 @@ def _most_useful(keys: np.ndarray, usefulness: np.ndarray, count: int) -> np.nda
     """Of the different keys those with the largest sums: all but a tenth, and `count` in the end. NaN is none."""
     found, which = np.unique(keys[~np.isnan(keys)], return_inverse=True)
     total = np.bincount(which, usefulness[~np.isnan(keys)])
-    count = max(count, min(np.count_nonzero(total), int((1 - REMOVED) * len(found))))
+    count = max(count, min(int(np.count_nonzero(total)), int((1 - REMOVED) * len(found))))
     return found[np.argsort(-total)[:count]]
 
 
@@ -228,9 +228,9 @@ def _values(table: np.ndarray) -> np.ndarray:
 
 def _design(lobes: ggx.Lobes) -> np.ndarray:
     """The lobes at all directions, (N, B)."""
-    _, wi, wo, _ = _directions()
-    wi, wo = (drjit.auto.Array3f64(np.ascontiguousarray(w.T)) for w in (wi, wo))
-    result = np.empty((len(_directions().wi), len(lobes)))
+    used = _directions()
+    wi, wo = (drjit.auto.Array3f64(np.ascontiguousarray(w.T)) for w in (used.wi, used.wo))
+    result = np.empty((len(used.wi), len(lobes)))
     for alpha, members in lobes.groups():  # a kernel each
         numbers, etas = zip(*members, strict=True)
         result[:, numbers] = np.array(ggx.lobes(ggx.Lobes((alpha,) * len(etas), etas), wi, wo)).T

@@ -111,8 +111,8 @@ def finite_differences(
         "mitsuba": mi.__version__,
         "variant": mi.variant(),
     }
-    layers = (half, standard_error, np.abs(whole - half))
-    return FiniteDifferences(*(a.astype(np.float32) for a in layers), settings)
+    mean, error, step_error = (a.astype(np.float32) for a in (half, standard_error, np.abs(whole - half)))
+    return FiniteDifferences(mean, error, step_error, settings)
 
 
 @no_collection()

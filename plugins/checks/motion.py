@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import no_collection
+from rimlight.edge_sampling.geometry.meshes import is_positions_key
 
 
 class Motion:
@@ -50,7 +51,7 @@ class Motion:
             raise ValueError(f'"{key}": give either a direction or an axis to rotate about')
         value = self.params[key]
         self.key = key
-        self.is_positions = key.endswith("vertex_positions")
+        self.is_positions = is_positions_key(key)
         self.is_transform = key.endswith("to_world")
         self.is_tensor = dr.is_tensor_v(value)
         if not (self.is_positions or self.is_transform or dr.is_float_v(value)):
@@ -93,17 +94,18 @@ class Motion:
     def __str__(self) -> str:
         numbers = lambda a: "(" + ", ".join(f"{x:g}" for x in a) + ")"
         how = f"along {numbers(self.direction)}" if self.rotate is None else f"about {numbers(self.rotate)}"
-        chosen = [] if self.moves is None or self.moves.all() else np.flatnonzero(self.moves)
-        return f"{self.key} {how}" + (f", vertices {', '.join(map(str, chosen))}" if len(chosen) else "")
+        if self.moves is None or self.moves.all():
+            return f"{self.key} {how}"
+        return f"{self.key} {how}, vertices {', '.join(map(str, np.flatnonzero(self.moves)))}"
 
     def apply(self, theta: mi.Float | float) -> None:
         """Set the parameter to p(θ) and update the scene; attached if `theta` is."""
         theta = mi.Float(theta)
         if self.is_positions:
-            p = dr.unravel(mi.Point3f, self.initial)
+            p = dr.unravel(mi.Point3f, self.initial.array if self.is_tensor else self.initial)
             moved = self._transform(theta) @ p
-            moved = dr.select(mi.Float(self.moves) > 0, moved, p)
-            value = dr.ravel(moved)
+            moved = dr.ravel(dr.select(mi.Float(self.moves) > 0, moved, p))
+            value = type(self.initial)(moved, self.initial.shape) if self.is_tensor else moved
         elif self.is_transform:
             value = self._transform(theta) @ self.initial
         else:
@@ -120,7 +122,9 @@ class Motion:
     def _transform(self, theta: mi.Float) -> mi.AffineTransform4f:
         T = mi.Transform4f
         if self.rotate is None:
+            assert self.direction is not None
             return T().translate(theta * _vector(self.direction))
+        assert self.pivot is not None
         axis, pivot = _vector(self.rotate / np.linalg.norm(self.rotate)), _vector(self.pivot)
         return T().translate(pivot) @ T().rotate(axis, dr.rad2deg(theta)) @ T().translate(-pivot)
 

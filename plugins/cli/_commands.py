@@ -15,6 +15,7 @@ from tyro.conf import UseAppendAction, arg
 import rimlight
 from rimlight import pictures
 from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
+from rimlight.edge_sampling.geometry.meshes import is_positions_key
 from rimlight.exr import write_exr
 from rimlight.loading import InputError, expected, load_integrator, use_variant
 
@@ -69,7 +70,7 @@ class PlanCommand(OnSensor):
         keys = list(self.param) or [
             key
             for key, _, _ in _loading.differentiable(scene)
-            if key.endswith("vertex_positions") or key == _loading.camera_key(scene, self.sensor)
+            if is_positions_key(key) or key == _loading.camera_key(scene, self.sensor)
         ]
         with expected(ValueError, RuntimeError, pattern=REFUSAL):
             print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
@@ -308,9 +309,14 @@ class _Ps:
     """Photometric stereo: find shape and reflectance from images under many lights."""
 
 
+@dataclass(frozen=True)
+class _Bench:
+    """Compare speed and error with Mitsuba's own integrators on this machine. Takes about five minutes."""
+
+
 def commands(argv: Sequence[str]) -> dict[str, type]:
     """Commands by their names. argv : for one whose options depend on a file that they name."""
-    fit, reproduce, reflectance, ps = _Fit, _Reproduce, _Reflectance, _Ps
+    fit, reproduce, reflectance, ps, bench = _Fit, _Reproduce, _Reflectance, _Ps, _Bench
     if argv[:1] in (["fit"], ["reproduce"]):
         from . import _fit  # only now, since it imports much
 
@@ -319,6 +325,8 @@ def commands(argv: Sequence[str]) -> dict[str, type]:
         from ._reflectance import Reflectance as reflectance
     if argv[:1] == ["ps"]:
         from ._ps import Ps as ps
+    if argv[:1] == ["bench"]:
+        from ._bench import Bench as bench
     return {
         "sys-info": SysInfo,
         "params": Params,
@@ -331,5 +339,6 @@ def commands(argv: Sequence[str]) -> dict[str, type]:
         "reproduce": reproduce,
         "reflectance": reflectance,
         "ps": ps,
+        "bench": bench,
         "demo": Demo,
     }

@@ -10,6 +10,7 @@ import numpy as np
 from rimlight.edge_sampling import Edges, FilmBoundary, jumping_textures
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.geometry.edges import EdgeKind
+from rimlight.edge_sampling.geometry.meshes import has_texcoords
 from rimlight.transport.channels import LABELS, OF_TRIANGLES, Channel
 from rimlight.transport.paths import Depths
 
@@ -56,7 +57,7 @@ class ChannelSearch(BoundarySearch):
         channels depend on their texture coordinates, and where the place in a triangle stands for those."""
         everywhere = np.array(
             [
-                bool(self.kinds & OF_TRIANGLES) or ("uv" in self.kinds and not m.has_vertex_texcoords())
+                bool(self.kinds & OF_TRIANGLES) or ("uv" in self.kinds and not has_texcoords(m))
                 for m in self.geometry.meshes
             ],
             bool,
