@@ -15,7 +15,7 @@ import numpy as np
 from rimlight.exr import replacing
 
 #: Of the file's layout.
-VERSION = 1
+VERSION = 2
 
 
 def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
@@ -29,7 +29,7 @@ def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any])
     """
     text = json.dumps({**facts, "version": VERSION})
     with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **{f"array/{name}": array for name, array in arrays.items()}, facts=np.array(text))
+        np.savez_compressed(file, **{f"array/{name}": array for name, array in arrays.items()}, facts=np.array(text))
         file.flush()
         os.fsync(file.fileno())
 

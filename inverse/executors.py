@@ -44,7 +44,9 @@ def _use_threads(count: int) -> None:
 
 
 def _text(problem: Problem) -> str:
-    return problems.text(problems.relative_to(problem, Path.cwd()))
+    text = problems.text(problems.relative_to(problem, Path.cwd()))
+    problems.check_is_text(text)
+    return text
 
 
 class Processes:

@@ -364,8 +364,10 @@ def _body(key: str) -> str:
 
 
 def _numbers(numbers: tuple[float, ...], counts: set[int], name: str, expected: str) -> np.ndarray:
-    if len(numbers) not in counts or not np.isfinite(numbers).all():
+    if len(numbers) not in counts:
         raise ValueError(f'fit: the start of "{name}" needs {expected}, got {len(numbers)}')
+    if bad := [x for x in numbers if not np.isfinite(x)]:
+        raise ValueError(f'fit: the start of "{name}" must be finite, got {bad[0]}')
     return np.array(numbers, np.float64)
 
 

@@ -4,36 +4,29 @@ from __future__ import annotations
 
 import datetime
 import html
-import io
-import logging
 import platform
 import re
 import shutil
-import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import drjit as dr
-import matplotlib
 import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw, ImageFont
 
 import rimlight
 from rimlight import pictures
 from rimlight.exr import replacing, write_exr
 from rimlight.sys_info import processor
 
-from . import fitting, page
+from . import page
 from . import problem as problems
-from .fitting import WINDOW, Fit
+from .animation import goal, write_animation
 from .page import number
-from .targets import resample
-
-log = logging.getLogger(__name__)
+from .result import WINDOW, Result, summary
 
 #: Parameters of so few numbers are shown number by number.
 FEW = 16
@@ -41,16 +34,8 @@ FEW = 16
 #: Curves of one plot.
 CURVES = 12
 
-#: What a loss is: name, unit.
-NORMS = {
-    "l1": ("mean absolute difference", "radiance"),
-    "l2": ("mean squared difference", "radiance²"),
-    "relative": ("mean squared relative difference", ""),
-    "classifier": ("log p of what shall fall − of what shall rise", ""),
-}
 
-
-def write(folder: Path, fit: Fit, *, title: str) -> None:
+def write(folder: Path, fit: Result, *, title: str) -> None:
     """Write all of a result into a folder, which is made if need be.
 
     ``report.html``; ``convergence.mp4`` or ``.gif``; ``result.json``, the summary; ``result.npz``, key -> value;
@@ -58,24 +43,56 @@ def write(folder: Path, fit: Fit, *, title: str) -> None:
 
     Raises
     ------
-    OSError : something cannot be written. Nothing of a file is there before it is complete.
+    OSError : something cannot be written, while all else is. Nothing of a file is there before it is complete.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / "result.json") as temporary:
-        temporary.write_text(fitting.summary(fit) + "\n", "utf-8")
-    with replacing(folder / "result.npz") as temporary:
-        np.savez(temporary, **fit.values)
-    problems.write(folder / "problem.toml", fit.problem)
+    failed: list[OSError] = []
+
+    def attempt(job: Callable[[], object]) -> None:
+        """One file that does not fit shall not keep the others from being written."""
+        try:
+            job()
+        except OSError as error:
+            failed.append(error)
+
+    attempt(lambda: _write_text(folder / "result.json", summary(fit) + "\n"))
+    attempt(lambda: _write_values(folder / "result.npz", fit.values))
+    attempt(lambda: problems.write(folder / "problem.toml", fit.problem))
+    attempt(lambda: _write_page(folder / "report.html", fit, write_animation(folder, fit), title, ""))
     for i, view in enumerate(fit.views):
         for name, image in (("start", view.start), ("result", view.result), ("target", view.target)):
-            write_exr(folder / f"{name}_{i}.exr", {"": image})
-            pictures.write_image(folder / f"{name}_{i}.png", image)
-    animation = write_animation(folder, fit)
-    _write_page(folder / "report.html", fit, animation, title, "")
+            path = folder / f"{name}_{i}"
+            attempt(lambda path=path, image=image: write_exr(path.with_suffix(".exr"), {"": image}))
+            attempt(lambda path=path, image=image: pictures.write_image(path.with_suffix(".png"), image))
+    if failed:
+        more = f", and {len(failed) - 1} other files" if len(failed) > 1 else ""
+        free = shutil.disk_usage(folder).free / 1e6
+        raise OSError(f"{failed[0]}{more}; {free:.3g} MB are free there, what could be written is in {folder}")
 
 
-def write_report(path: Path, fit: Fit, *, title: str, text: str = "") -> None:
+def _write_text(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text, "utf-8")
+
+
+def _write_values(path: Path, values: Mapping[str, np.ndarray]) -> None:
+    with replacing(path) as temporary:
+        np.savez(temporary, **values)
+
+
+def brief(fit: Result) -> str:
+    """How a fit went, in a piece of HTML: one line, and the pictures of the first view."""
+    view = fit.views[0]
+    shown = (("before", view.start), ("result", view.result), (goal(fit), view.target))
+    figures = "".join(
+        f'<figure style="margin: 0">{page.picture(image, name)}<figcaption>{name}</figcaption></figure>'
+        for name, image in shown
+    )
+    return f'<div>{_verdict(fit)}<div style="display: flex; flex-wrap: wrap; gap: 1em">{figures}</div></div>'
+
+
+def write_report(path: Path, fit: Result, *, title: str, text: str = "") -> None:
     """Write one HTML file with everything inside.
 
     title, text : plain text; empty lines separate paragraphs.
@@ -88,7 +105,7 @@ def write_report(path: Path, fit: Fit, *, title: str, text: str = "") -> None:
         _write_page(Path(path), fit, write_animation(Path(folder), fit), title, text)
 
 
-def _write_page(path: Path, fit: Fit, animation: Path, title: str, text: str) -> None:
+def _write_page(path: Path, fit: Result, animation: Path, title: str, text: str) -> None:
     sections = [
         f"<header>\n<h1>{html.escape(title)}</h1>\n{_verdict(fit)}\n{page.paragraphs(text)}\n</header>",
         _views(fit),
@@ -97,14 +114,13 @@ def _write_page(path: Path, fit: Fit, animation: Path, title: str, text: str) ->
         _animation(animation, fit),
         _settings(fit),
     ]
-    with replacing(path) as temporary:
-        temporary.write_text(page.page(title, "\n".join(sections)), "utf-8")
+    _write_text(path, page.page(title, "\n".join(sections)))
 
 
 # ------------------------------------------------------------------ sections of the page
 
 
-def _verdict(fit: Fit) -> str:
+def _verdict(fit: Result) -> str:
     """One line that says how it went, and what one should know before one trusts it."""
     stages = fit.problem.stage
     planned = sum(stage.iterations for stage in stages) + (fit.problem.starts.count - 1) * stages[0].iterations
@@ -114,8 +130,7 @@ def _verdict(fit: Fit) -> str:
     if len(fit.losses):
         first, last = _loss_before_and_after(fit)
         facts.append(f"loss {number(first)} → {number(last)}")
-    measures = fit.measures[0].items()
-    for label, (before, after) in ((label, pair) for label, pair in measures if label.startswith("probability")):
+    for label, (before, after) in ((label, pair) for label, pair in fit.measures[0].items() if label in fit.scores):
         facts.append(f"{label} {number(before)} → {number(after)}")
     for unit, labels in _by_unit(fit.errors).items():
         worst = max(labels, key=lambda label: fit.errors[label][-1])
@@ -130,7 +145,7 @@ def _verdict(fit: Fit) -> str:
     return line
 
 
-def _warnings(fit: Fit) -> list[str]:
+def _warnings(fit: Result) -> list[str]:
     found = []
     if fit.status != "finished":
         found.append(f"The fit did not finish: {fit.status}. The result is the best that it had seen by then.")
@@ -139,59 +154,51 @@ def _warnings(fit: Fit) -> list[str]:
         found.append(f"Without influence on the pictures, and so not fitted: {names}. The gradient was always 0.")
     if fit.skipped:
         steps = "1 step was" if fit.skipped == 1 else f"{fit.skipped} steps were"
-        found.append(f"{steps} skipped because the gradient was not finite.")
+        found.append(f"{steps} skipped because a number was not finite.")
+    found += fit.doubts
     for i, measures in enumerate(fit.measures):
         before, after = measures["root mean square error"]
         if not np.isfinite(after):
             found.append(f"{_name(fit, i)} has pixels that are not finite.")
-        elif _compares(fit) and after > 1.02 * before:  # not by noise alone
+        elif fit.problem.compares and after > 1.02 * before:  # not by noise alone
             found.append(f"{_name(fit, i)} is farther from its target than at the start.")
     return found
 
 
-def _compares(fit: Fit) -> bool:
-    return fit.problem.loss.norm != "classifier"
-
-
-def _goal(fit: Fit) -> str:
-    """What the target shows. What a classifier looks at has none, and is shown beside its beginning."""
-    return "target" if _compares(fit) else "scene as it was"
-
-
-def _loss_before_and_after(fit: Fit) -> tuple[float, float]:
+def _loss_before_and_after(fit: Result) -> tuple[float, float]:
     """The first loss, and the mean of the last ones."""
     last = fit.losses[fit.segments == fit.segments[-1]][-WINDOW:]
     last = last[np.isfinite(last)]
     return float(fit.losses[0]), float(last.mean()) if last.size else float("nan")
 
 
-def _name(fit: Fit, view: int) -> str:
+def _name(fit: Result, view: int) -> str:
     return "The picture" if len(fit.views) == 1 else f"View {view}"
 
 
-def _views(fit: Fit) -> str:
-    goal = _goal(fit)
-    sections = [f"<section>\n<h2>Result and {goal}</h2>"]
+def _views(fit: Result) -> str:
+    aim = goal(fit)
+    sections = [f"<section>\n<h2>Result and {aim}</h2>"]
     for i, (view, measures) in enumerate(zip(fit.views, fit.measures, strict=True)):
         if len(fit.views) > 1:
             sections.append(f"<h3>View {i}</h3>")
         counts = (view.weight > 0)[..., None]
         panels = [
-            (f"{label} − {goal}", np.where(counts, image - view.target, np.float32(0)))
-            for label, image in (("before", view.start), ("result", view.result))[not _compares(fit) :]
+            (f"{label} − {aim}", np.where(counts, image - view.target, np.float32(0)))
+            for label, image in (("before", view.start), ("result", view.result))[not fit.problem.compares :]
         ]
         if i == 0 and fit.derivative is not None:
             panels.append(("derivative on the way from before to result", fit.derivative))
         rows = [(label, number(before, 4), number(after, 4)) for label, (before, after) in measures.items()]
         sections.append(
-            f'<div class="row">\n{page.compare(view.start, view.result, view.target, _name(fit, i), goal)}\n'
-            f'<div class="side">\n{page.table(("", "before", "result"), rows, f"Likeness to the {goal}")}\n'
+            f'<div class="row">\n{page.compare(view.start, view.result, view.target, _name(fit, i), aim)}\n'
+            f'<div class="side">\n{page.table(("", "before", "result"), rows, f"Likeness to the {aim}")}\n'
             f"<h3>Differences</h3>\n{page.differences(panels)}\n</div>\n</div>"
         )
     return "\n".join([*sections, "</section>"])
 
 
-def _parameters(fit: Fit) -> str:
+def _parameters(fit: Result) -> str:
     sections = ['<section>\n<h2>Parameters</h2>\n<div class="row">']
     if fit.errors:
         ratio = lambda e: number(e[-1] / e[0], 2) if e[0] else "–"
@@ -203,18 +210,18 @@ def _parameters(fit: Fit) -> str:
     return "\n".join([*sections, f"<div>\n<h3>Values</h3>\n{shown}\n</div>\n</div>\n</section>"])
 
 
-def _angle(fit: Fit, name: str) -> bool:
+def _angle(fit: Result, name: str) -> bool:
     """Is this latent the rotation vector of a rigid body?"""
     return name.endswith(".turn") and not any(name in free.key for free in fit.problem.free)
 
 
-def _latent_name(fit: Fit, name: str) -> str:
+def _latent_name(fit: Result, name: str) -> str:
     if any(name in free.key for free in fit.problem.free):
         return name
     return f"{name} ({'degrees' if _angle(fit, name) else 'scene units'})"
 
 
-def _numbers(fit: Fit, name: str) -> tuple[str, str]:
+def _numbers(fit: Result, name: str) -> tuple[str, str]:
     """Start and result: few numbers one by one, points and colours on lines of their own; else their mean."""
     smoothed = any(free.smoothing and name in free.key for free in fit.problem.free)
     found = []
@@ -240,9 +247,9 @@ def _grid(numbers: np.ndarray, per_line: int) -> str:
     return "\n".join("  ".join(padded[i : i + per_line]) for i in range(0, len(padded), per_line))
 
 
-def _animation(file: Path, fit: Fit) -> str:
+def _animation(file: Path, fit: Result) -> str:
     data, last = file.read_bytes(), fit.frames[-1][0]
-    text = f"From step 0 to step {last}, beside the {_goal(fit)}"
+    text = f"From step 0 to step {last}, beside the {goal(fit)}"
     if file.suffix == ".mp4":
         uri = page.data_uri(data, "video/mp4")
         shown = f'<video src="{uri}" aria-label="{text}" autoplay loop muted playsinline controls></video>'
@@ -251,7 +258,7 @@ def _animation(file: Path, fit: Fit) -> str:
     return f"<section>\n<h2>Convergence</h2>\n<figure>{shown}\n<figcaption>{text}.</figcaption></figure>\n</section>"
 
 
-def _settings(fit: Fit) -> str:
+def _settings(fit: Result) -> str:
     facts = {
         "Rimlight": rimlight.__version__,
         "Mitsuba": mi.__version__,
@@ -274,17 +281,15 @@ def _settings(fit: Fit) -> str:
 # ------------------------------------------------------------------ curves
 
 
-def _curves(fit: Fit) -> str:
+def _curves(fit: Result) -> str:
     """Loss and errors over the steps. Errors of different units are in different plots."""
     plots = []
     if len(fit.losses):
-        name, unit = NORMS[fit.problem.loss.norm]
-        label = f"loss: {name}" + (f" ({unit})" if unit else "")
         note = f"Each step, and the mean of {2 * (WINDOW // 2) + 1} around it."
-        plots.append(_plot(fit, {"": fit.losses}, "Loss", label, note))
+        plots.append(_plot(fit, {"": fit.losses}, "Loss", f"loss: {fit.loss}", note))
     if fit.scores:
         note = "At the noisy picture of each step."
-        plots.append(_plot(fit, fit.scores, "Classes", "probability", note, linear=True))
+        plots.append(_plot(fit, fit.scores, "Metrics of the loss", "", note, linear=True))
     for unit, labels in _by_unit(fit.errors).items():
         shown = sorted(labels, key=lambda label: -fit.errors[label][-1])[:CURVES]
         note = f"The {CURVES} largest at the end, of {len(labels)}." if len(labels) > CURVES else ""
@@ -306,7 +311,7 @@ def _without_unit(label: str) -> str:
     return re.sub(r" \([^()]*\)$", "", label)
 
 
-def _plot(fit: Fit, curves: Mapping[str, np.ndarray], title: str, y: str, note: str, *, linear: bool = False) -> str:
+def _plot(fit: Result, curves: Mapping[str, np.ndarray], title: str, y: str, note: str, *, linear: bool = False) -> str:
     """A figure of HTML. curves : label -> values before each step; of one without a label, the running mean is added.
     linear : no logarithms, which negative values rule out anyway.
 
@@ -352,7 +357,7 @@ def _running_mean(values: np.ndarray, segments: np.ndarray) -> np.ndarray:
     return found
 
 
-def _mark_segments(axes: Axes, fit: Fit) -> None:
+def _mark_segments(axes: Axes, fit: Result) -> None:
     """Thin lines where a stage or another start begins, with what begins there if there is room."""
     begins = [0, *(np.flatnonzero(np.diff(fit.segments)) + 1)] if len(fit.segments) else []
     starts = fit.problem.starts.count
@@ -364,90 +369,3 @@ def _mark_segments(axes: Axes, fit: Fit) -> None:
             explored = starts > 1 and segment < starts
             label = f"start {segment + 1}" if explored else f"stage {segment + 2 - starts}"
             axes.text(step, 1.01, label, transform=axes.get_xaxis_transform(), fontsize=7.5, color=page.INK)
-
-
-# ------------------------------------------------------------------ animation
-
-#: Frames per second, and frames for which the last one stays.
-FPS, HOLD = 10, 15
-
-#: Size to which small pictures of the animation are enlarged, and of larger ones; pixels.
-ENLARGED, LARGEST = 320, 400
-
-#: Largest size of an animation, bytes. Longer ones lose every second picture.
-MOST = 4_000_000
-
-#: Around the pictures, and height of the text below them; pixels.
-MARGIN, TEXT = 8, 26
-
-
-def write_animation(folder: Path, fit: Fit) -> Path:
-    """Write how the first view changed: ``convergence.mp4`` if ffmpeg is there, else ``convergence.gif``.
-
-    Returns
-    -------
-    The file. Its pictures are `fit.frames`, with the target, or the scene as it was, to their right.
-
-    Raises
-    ------
-    OSError : it cannot be written.
-    """
-    frames = [_beside_target(step, image, fit.views[0].target, _goal(fit)) for step, image in fit.frames]
-    if program := shutil.which("ffmpeg"):
-        try:
-            return _write_video(folder / "convergence.mp4", frames, program)
-        except (OSError, subprocess.SubprocessError) as error:
-            log.info("ffmpeg makes no video (%s), a GIF is written instead", error)
-    return _write_gif(folder / "convergence.gif", frames)
-
-
-def _beside_target(step: int, image: np.ndarray, target: np.ndarray, goal: str) -> Image.Image:
-    image = page.shrunk(image, LARGEST, LARGEST)
-    height, width = image.shape[:2]
-    factor = max(ENLARGED // max(height, width), 1)
-    size = width * factor, height * factor
-    panel = max(size[0], 100)  # wide enough for the text
-    even = lambda n: n + n % 2  # as videos want it
-    canvas = Image.new("RGB", (even(2 * panel + 3 * MARGIN), even(size[1] + MARGIN + TEXT)), "#16191d")
-    draw = ImageDraw.Draw(canvas)
-    font = ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), 13)
-    for i, (shown, label) in enumerate(
-        ((image, f"step {step}"), (resample(np.nan_to_num(target), (height, width)), goal))
-    ):
-        left = MARGIN + i * (panel + MARGIN)
-        pixels = Image.fromarray(pictures.to_srgb(shown)).resize(size, Image.Resampling.NEAREST)
-        canvas.paste(pixels, (left + (panel - size[0]) // 2, MARGIN))
-        draw.text((left, MARGIN + size[1] + 5), label, fill="#dde3ea", font=font)
-    return canvas
-
-
-def _write_video(path: Path, frames: Sequence[Image.Image], program: str) -> Path:
-    width, height = frames[0].size
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(FPS), "-i", "-"]
-    coding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
-    data = b"".join(frame.tobytes() for frame in [*frames, *[frames[-1]] * HOLD])
-    with replacing(path) as temporary:
-        command = [program, "-y", "-loglevel", "error", *source, *coding, str(temporary)]
-        subprocess.run(command, input=data, capture_output=True, check=True, timeout=120)
-    return path
-
-
-def _write_gif(path: Path, frames: Sequence[Image.Image]) -> Path:
-    """All frames share the colours of the first, the middle and the last one, undithered: smaller, and no flicker."""
-    chosen = [frames[i] for i in (0, len(frames) // 2, -1)]
-    width, height = frames[0].size
-    together = Image.new("RGB", (width, height * len(chosen)))
-    for i, frame in enumerate(chosen):
-        together.paste(frame, (0, i * height))
-    palette = together.quantize(255)
-    shown = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    while True:
-        file = io.BytesIO()
-        durations = [1000 // FPS] * (len(shown) - 1) + [1000 * HOLD // FPS]
-        shown[0].save(file, "GIF", save_all=True, append_images=shown[1:], duration=durations, loop=0)
-        if file.tell() <= MOST or len(shown) < 8:
-            break
-        shown = [*shown[:-1:2], shown[-1]]
-    with replacing(path) as temporary:
-        temporary.write_bytes(file.getvalue())
-    return path

@@ -27,8 +27,9 @@ from rimlight.scenes import room, traffic_sign
 
 from . import classifier, report
 from . import problem as problems
-from .fitting import Fit, fit
+from .fitting import fit
 from .problem import Problem
+from .result import Result
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ class Outcome:
 
     left : largest error of a parameter over that at the start; pose : of rigid bodies alone. values : median over
         objects of the largest relative error of their materials and lights. picture, noise : root mean square errors
-        of the first view, at the result and at the truth. status : see `Fit`; "cannot: …" if the integrator raised.
+        of the first view, at the result and at the truth. status : see `Result`; "cannot: …" if the integrator raised.
     times, losses : of each step. rise, fall : probabilities, at the result, of the classes that a classifier shall see
         and not see, the least and the greatest; then there is no truth, and what is measured by it is 0.
     """
@@ -175,7 +176,7 @@ def _cannot(name: str, seed: int, error: Exception) -> Outcome:
     return Outcome(name, seed, PEER, 1.0, 1.0, unknown, unknown, unknown, 0.0, f"cannot: {reason}", [], [])
 
 
-def _judge(name: str, seed: int, method: str, found: Fit) -> Outcome:
+def _judge(name: str, seed: int, method: str, found: Result) -> Outcome:
     left = {label: float(e[-1] / e[0]) for label, e in found.errors.items() if e[0] > 0}
     relative: dict[str, float] = {}  # the largest of each object
     for label, e in found.errors.items():

@@ -72,7 +72,7 @@ class Fit:
         return {"finished": 0, "out of time": 0, "interrupted": 130}.get(found.status, 1)
 
 
-def _print(found: inverse.Fit, out: Path) -> None:
+def _print(found: inverse.Result, out: Path) -> None:
     print(f"{found.status}: {len(found.losses)} steps in {found.seconds:.1f} s")
     for label, errors in found.errors.items():
         print(f"  {label}: {errors[0]:.4g} -> {errors[-1]:.4g}")
@@ -82,7 +82,7 @@ def _print(found: inverse.Fit, out: Path) -> None:
         if found.floors:
             print(f"  view {i}, root mean square error at the truth (noise): {found.floors[i]:.4g}")
     if found.skipped:
-        print(f"  {found.skipped} steps were left out: their gradients were not finite")
+        print(f"  {found.skipped} steps were left out: a number would not have been finite")
     for name in found.silent:
         print(f'  "{name}" has no influence on the pictures')
     print(f"report: {out / 'report.html'}")
