@@ -134,7 +134,8 @@ class Fit:
         self.plan = [*explored, *(Segment(*entry) for entry in stages[1:])]
         self.total = sum(segment.stage.iterations for segment in self.plan)
         self.progress = Progress()
-        self._began, self._before, self._saved, self._due = None, 0.0, 0, 0.0
+        self._began, self._before = None, 0.0
+        self._saved, self._cost = 0.0, 0.0  # when the last checkpoint was written, and how long that took, seconds
 
     # ---------------------- The loop ----------------------
 
@@ -193,16 +194,16 @@ class Fit:
     def _clock_starts(self) -> None:
         if self._began is None:
             self._began, self._before = time.monotonic(), self.progress.seconds
-            self._due = self._began + INTERVAL
+            self._saved = self._began
 
     def _settle(self) -> None:
         """After a step: is it the last one? Is it time for a checkpoint?"""
         now = self.progress
         if now.bad >= self.problem.max_bad:
-            self.stop(f"gave up: {now.bad} steps in a row would have led to numbers that are not finite")
+            self.stop(f"gave up: {now.bad} steps in a row led to numbers that are not finite")
         elif self.problem.seconds is not None and now.seconds > self.problem.seconds:
             self.stop("out of time")
-        if time.monotonic() > self._due:
+        if time.monotonic() - self._saved > max(INTERVAL, self._cost / progress.SHARE):
             self._save()
 
     def _step(self) -> Step:
@@ -439,8 +440,8 @@ class Fit:
                 log.warning("%s (%.3g MB are free there)", error, free / 1e6)
             else:
                 self.status = f"stopped: {error} ({free / 1e6:.3g} MB are free there)"
-        ended = time.monotonic()
-        self._due = ended + max(INTERVAL, (ended - began) / progress.SHARE)
+        self._saved = time.monotonic()
+        self._cost = self._saved - began
 
 
 def _board(folder: Path) -> Any:

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from rimlight.inverse import free_parameters, losses, renderer
+from rimlight.inverse import result as results
 from rimlight.inverse.fitting import Fit
 from rimlight.inverse.optimisers import inner_product
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
@@ -135,7 +136,9 @@ def test_derivative_image_is_that_on_the_way(room):
         return run.renderer.image(run.values(at), Task(0, None, 4096, seed)).astype(np.float64)
 
     seeds, at = range(4), run.values(result)
-    found = np.mean([run.renderer.derivative(at, run._way(result), Task(0, None, 1024, seed)) for seed in seeds], 0)
+    found = np.mean(
+        [run.renderer.derivative(at, results._way(run, result), Task(0, None, 1024, seed)) for seed in seeds], 0
+    )
     expected = np.mean([image(step, 9 + seed) - image(-step, 9 + seed) for seed in seeds], 0) / (2 * step)
     print(np.abs(found - expected).sum() / np.abs(expected).sum())
     assert np.abs(found - expected).sum() < 0.04 * np.abs(expected).sum()

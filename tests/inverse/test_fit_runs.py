@@ -20,7 +20,7 @@ import pytest
 
 from rimlight import inverse, scenes
 from rimlight.cli import main
-from rimlight.inverse import checkpoint, executors, fitting, report
+from rimlight.inverse import checkpoint, executors, fitting, progress, report
 from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Starts, Target
 from rimlight.inverse.renderer import Renderer, Task
@@ -66,10 +66,10 @@ from rimlight import inverse
 import drjit as dr
 import numpy as np
 from rimlight import exr
-from rimlight.inverse import checkpoint, fitting, problem
+from rimlight.inverse import checkpoint, fitting, problem, progress
 
 dr.set_thread_count(1)
-fitting.INTERVAL = 0
+fitting.INTERVAL, progress.SHARE = 0, float("inf")  # a checkpoint after each step
 
 folder, start, end, last = sys.argv[1:]
 run = fitting.Fit(problem.read("fit.toml"), out=folder, resume=start == "resume")
@@ -216,6 +216,7 @@ def test_a_full_disk_stops_the_fit(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(fitting, "INTERVAL", 0)
+    monkeypatch.setattr(progress, "SHARE", float("inf"))  # a checkpoint after each step
     run = fitting.Fit(triangles(), out=tmp_path)
     steps = iter(run)
     next(steps), next(steps)
@@ -239,9 +240,7 @@ def test_a_report_is_written_with_what_fits(tmp_path, monkeypatch):
 
     found = fit(triangles(steps=1))
     monkeypatch.setattr(report, "write_exr", full)
-    with pytest.raises(
-        OSError, match=r"start_0\.exr: No space left on device, and 2 other files; .* MB are free there"
-    ):
+    with pytest.raises(OSError, match=r"start_0\.exr: No space left on device, and 2 other files; .* MB are free"):
         inverse.write(tmp_path, found, title="Full")
     names = {path.name for path in tmp_path.iterdir()}
     assert names >= {"report.html", "result.json", "result.npz", "problem.toml", "result_0.png", "target_0.png"}

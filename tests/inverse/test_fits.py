@@ -210,7 +210,7 @@ def test_gradients_that_are_not_finite_are_left_out(broken):
     assert [i for i in range(1, 12) if np.array_equal(executor.seen[i - 1], executor.seen[i])] == [4, 7, 8]
     assert np.isfinite(found.values[COLOUR]).all()
     gives_up = fit(triangles(MATERIAL, steps=40, max_bad=3), executor=Valley({i: broken for i in range(15, 40)}))
-    assert gives_up.status == "gave up: 3 gradients in a row were not finite"
+    assert gives_up.status == "gave up: 3 steps in a row led to numbers that are not finite"
     assert len(gives_up.losses) == 17 and gives_up.skipped == 3
     assert np.isfinite(gives_up.values[COLOUR]).all()
 

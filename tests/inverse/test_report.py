@@ -16,7 +16,7 @@ from PIL import Image
 
 from rimlight import scenes
 from rimlight.exr import read_exr
-from rimlight.inverse import animation, fitting, page, problem, report
+from rimlight.inverse import animation, fitting, page, problem, report, result
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
 from rimlight.inverse.result import Result
 
@@ -127,7 +127,7 @@ def test_odd_fits_can_be_shown(fit, tmp_path):
     view = fit.views[0]
     grey = [image[:20, :, :1] for image in (view.start * np.nan, view.result, view.target)]
     wide = [np.tile(image, (1, 40, 1)) for image in (view.start, view.result, view.target)]
-    views = [view, *(fitting.ViewOfFit(*images, images[0][..., 0] * 0) for images in (grey, wide))]
+    views = [view, *(result.ViewOfFit(*images, images[0][..., 0] * 0) for images in (grey, wide))]
     many = np.linspace(0, 1, 300, dtype=np.float32)
     odd = dataclasses.replace(
         fit,
@@ -142,7 +142,7 @@ def test_odd_fits_can_be_shown(fit, tmp_path):
         problem=dataclasses.replace(fit.problem, starts=Starts(count=2, value=0.1)),
     )
     shown = written(tmp_path / "a.html", odd)
-    assert all(image.width <= max(page.WIDEST, 2 * report.LARGEST) for image in shown.images())
+    assert all(image.width <= max(page.WIDEST, 2 * animation.LARGEST) for image in shown.images())
     for part in ("View 2", "not finite", "180.00", "1.000 × 10⁻⁶", "300 numbers, mean 0.5000", "start 2", "of 13"):
         assert part in shown.text
     assert "body.turn (degrees)" in shown.text
