@@ -16,6 +16,7 @@ from .progress import Step
 from .regularisers import prior, smooth_mesh, smooth_texture
 from .report import write, write_report
 from .result import Result, ViewOfFit
+from .torch_bridge import torch_loss, torch_render
 
 __all__ = [
     "Cluster",
@@ -37,6 +38,8 @@ __all__ = [
     "read",
     "smooth_mesh",
     "smooth_texture",
+    "torch_loss",
+    "torch_render",
     "write",
     "write_report",
 ]

@@ -243,7 +243,7 @@ def drjit_loss(function: Callable[[Any, Any, Any], Any], label: str = "") -> Los
 
         seen, *others = (mi.TensorXf(np.ascontiguousarray(a, np.float32)) for a in (image, target, weight))
         dr.enable_grad(seen)
-        value, metrics = _value_and_metrics(function(seen, *others))
+        value, metrics = value_and_metrics(function(seen, *others))
         dr.backward(value)
         return float(np.array(dr.detach(value)).item()), np.array(dr.grad(seen)).reshape(image.shape), metrics
 
@@ -251,7 +251,7 @@ def drjit_loss(function: Callable[[Any, Any, Any], Any], label: str = "") -> Los
     return loss
 
 
-def _value_and_metrics(found: Any) -> tuple[Any, dict[str, float]]:
+def value_and_metrics(found: Any) -> tuple[Any, dict[str, float]]:
     """Of what a function of the user returned: the number, and metrics if there are any."""
     value, metrics = found if isinstance(found, tuple) else (found, {})
     return value, {label: float(np.asarray(number).item()) for label, number in metrics.items()}

@@ -125,11 +125,24 @@ class Renderer:
         leaves = view.set(values, task.width)
         image = view.render(task.seed, task.spp)
         loss, by_pixel, scores = view.compared(image, task.stage)
-        view.backward(by_pixel, derived_seed(task.seed), task.spp)
+        return Gradient(loss, self._collected(view, leaves, by_pixel, derived_seed(task.seed), task.spp), image, scores)
+
+    def gradient_of(self, values: Mapping[str, np.ndarray], by_pixel: np.ndarray, task: Task) -> dict[str, np.ndarray]:
+        """The derivative of anything of which that with respect to each number of the picture is known.
+
+        by_pixel : (H, W, C), this one. task : its seed is that of the derivative image.
+        """
+        view = self.views[task.target]
+        return self._collected(view, view.set(values, task.width), by_pixel, task.seed, task.spp)
+
+    @staticmethod
+    def _collected(
+        view: View, leaves: Mapping[str, mi.Float], by_pixel: np.ndarray, seed: int, spp: int
+    ) -> dict[str, np.ndarray]:
+        view.backward(by_pixel, seed, spp)
         found = {key: dr.grad(leaf) for key, leaf in leaves.items()}
         dr.eval(found)
-        gradients = {key: np.array(gradient, np.float32) for key, gradient in found.items()}
-        return Gradient(loss, gradients, image, scores)
+        return {key: np.array(gradient, np.float32) for key, gradient in found.items()}
 
     def derivative(self, values: Mapping[str, np.ndarray], change: Mapping[str, np.ndarray], task: Task) -> np.ndarray:
         """Derivative of a picture as the values change, forward: (H, W, C), float32.
@@ -296,6 +309,10 @@ class View:
             leaves[key] = leaf
         self.params.update()
         return leaves
+
+    def count(self, key: str) -> int:
+        """How many numbers a parameter has."""
+        return to_numpy(self.initial[key]).size
 
     def size_at(self, width: int | None) -> tuple[int, int]:
         """Height and width of the film."""
