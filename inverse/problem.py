@@ -308,8 +308,7 @@ def _converter() -> cattrs.Converter:
     for kind, (told, allowed) in EXACT.items():
         converter.register_structure_hook(kind, _exactly(told, allowed))
     converter.register_structure_hook(Path, lambda value, _: Path(value))
-    # In Python, what stands for a path may be an object.
-    converter.register_unstructure_hook(Path, lambda x: x.as_posix() if isinstance(x, Path) else IN_MEMORY + _kind(x))
+    converter.register_unstructure_hook(Path, Path.as_posix)
     # "key" may be one name.
     structure_free = make_dict_structure_fn(Free, converter, _cattrs_forbid_extra_keys=True)
     one_key = lambda d: {**d, "key": [d["key"]]} if isinstance(d.get("key"), str) else d
@@ -380,16 +379,23 @@ def text(problem: Problem) -> str:
 
 def tables(problem: Problem) -> dict[str, Any]:
     """A problem as a dictionary for TOML."""
-    return _plain(_converter().unstructure(problem))
+    # First of all, paths in place of arrays, which cannot be compared with defaults.
+    said = _with_sources(
+        problem, lambda source: source if isinstance(source, Path) else Path(IN_MEMORY + _kind(source))
+    )
+    return _plain(_converter().unstructure(said))
 
 
 def relative_to(problem: Problem, folder: Path) -> Problem:
     """The problem with all paths seen from a folder, absolute."""
-    place = lambda source: (folder / source).resolve() if isinstance(source, Path) else source
-    targets = tuple(
-        dataclasses.replace(t, file=place(t.file), scene=place(t.scene), mask=place(t.mask)) for t in problem.target
-    )
-    return dataclasses.replace(problem, scene=place(problem.scene), target=targets)
+    return _with_sources(problem, lambda source: (folder / source).resolve() if isinstance(source, Path) else source)
+
+
+def _with_sources(problem: Problem, change: Callable[[Any], Any]) -> Problem:
+    """The problem with other scenes and pictures. change : makes them of those that there are."""
+    of = lambda source: None if source is None else change(source)
+    targets = tuple(dataclasses.replace(t, file=of(t.file), scene=of(t.scene), mask=of(t.mask)) for t in problem.target)
+    return dataclasses.replace(problem, scene=of(problem.scene), target=targets)
 
 
 def _plain(value: Any) -> Any:
