@@ -46,9 +46,13 @@ def smooth_mesh(key: str, faces: Any, strength: float) -> Regulariser:
 
     def penalty(values: Mapping[str, Any]) -> mi.Float:
         place = dr.unravel(mi.Point3f, values[key])
-        offset = dr.zeros(mi.Vector3f, dr.width(place))
-        dr.scatter_add(offset, share * (dr.gather(mi.Point3f, place, j) - dr.gather(mi.Point3f, place, i)), i)
-        return strength * dr.mean(dr.squared_norm(offset))
+        towards = share * (dr.gather(mi.Point3f, place, j) - dr.gather(mi.Point3f, place, i))
+        squares = mi.Float(0)
+        for component in towards:
+            offset = dr.zeros(mi.Float, dr.width(place))
+            dr.scatter_add(offset, component, i)
+            squares += dr.square(offset)
+        return strength * dr.mean(squares)
 
     return penalty
 
