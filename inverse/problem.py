@@ -147,7 +147,7 @@ class Starts:
 @dataclass(frozen=True, kw_only=True)
 class Problem:
     """The complete description of a fit. It is written to TOML and read from it without loss, unless parts of it are
-    objects in memory. `target` may be pictures instead of `Target`s: then number i was taken by sensor i."""
+    objects in memory. `target` may hold pictures as they are: then number i was taken by sensor i."""
 
     scene: Scene
     """Scene file of Mitsuba 3. In Python also a dictionary, as for `mi.load_dict`, or an `mi.Scene`, which the fit
