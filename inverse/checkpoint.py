@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import replacing
 
 #: Of the file's layout.
@@ -49,7 +50,7 @@ def load(path: Path, who: str = "fit") -> tuple[dict[str, np.ndarray], dict[str,
     except FileNotFoundError:
         raise FileNotFoundError(f'{who}: there is no checkpoint "{path}" to resume from') from None
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f'{who}: "{path}" is no checkpoint, or damaged: {error}') from None
+        raise InputError(f'{who}: "{path}" is no checkpoint, or damaged: {error}') from None
     if facts.get("version") != VERSION:
-        raise ValueError(f'{who}: "{path}" has the layout {facts.get("version")}, this program writes {VERSION}')
+        raise InputError(f'{who}: "{path}" has the layout {facts.get("version")}, this program writes {VERSION}')
     return arrays, facts

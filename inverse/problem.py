@@ -321,7 +321,7 @@ def _exactly(told: str, allowed: tuple[type, ...]) -> Any:
 
     def structure(value: Any, kind: type) -> Any:
         if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
-            raise ValueError(f"fit: expected {told}, got {value!r}")
+            raise InputError(f"fit: expected {told}, got {value!r}")
         return kind(value)
 
     return structure
@@ -340,7 +340,7 @@ def read(path: Path | str) -> Problem:
     try:
         problem = from_text(path.read_text("utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise InputError(f"{path}: {error}") from None
     return relative_to(problem, path.parent)
 
 
@@ -350,11 +350,11 @@ def from_text(text: str) -> Problem:
     tables = parse(text)
     for name in ("target", "free", "stage"):
         if isinstance(tables.get(name), dict):
-            raise ValueError(f"fit: there may be several of {name}, write [[{name}]] instead of [{name}]")
+            raise InputError(f"fit: there may be several of {name}, write [[{name}]] instead of [{name}]")
     try:
         return _converter().structure(tables, Problem)
     except cattrs.BaseValidationError as error:
-        raise ValueError("; ".join(cattrs.transform_error(error, "fit", _say))) from None
+        raise InputError("; ".join(cattrs.transform_error(error, "fit", _say))) from None
 
 
 def _say(error: BaseException, kind: type | None) -> str:

@@ -21,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rimlight import scenes
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import replacing
 from rimlight.loading import one_line
 from rimlight.scenes import room, traffic_sign
@@ -117,7 +118,7 @@ def reproduce(
     """
     names = FIGURES.get(figure, (figure,))
     if not set(names) <= set(EXPERIMENTS):
-        raise ValueError(f'there is no experiment "{figure}", choose one of {", ".join([*EXPERIMENTS, *FIGURES])}')
+        raise InputError(f'there is no experiment "{figure}", choose one of {", ".join([*EXPERIMENTS, *FIGURES])}')
     if "fig10" in names:
         try:
             classifier.network()

@@ -51,7 +51,7 @@ def numbers(source: Any) -> np.ndarray:
         source = source.detach().cpu()
     array = np.asarray(source)
     if array.dtype.kind not in "fiub":
-        raise ValueError(f"fit: a picture is a path, an array or a tensor, got {type(source).__name__}")
+        raise InputError(f"fit: a picture is a path, an array or a tensor, got {type(source).__name__}")
     return array
 
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from skimage.transform import resize
 
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import read_exr
 from rimlight.loading import one_line
 
@@ -49,21 +50,21 @@ def read(target: Target, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
     who = f'fit: target "{_name(target.file)}"'
     largest = np.max(image, where=np.isfinite(image), initial=0)
     if colour == "srgb" and not encoded and largest > 1:
-        raise ValueError(f'{who} has values up to {largest:.3g}: it cannot be sRGB, set its colour to "linear"')
+        raise InputError(f'{who} has values up to {largest:.3g}: it cannot be sRGB, set its colour to "linear"')
     if colour == "linear" and Path(_name(target.file)).suffix.lower() in (".jpg", ".jpeg"):
-        raise ValueError(f'{who}: JPEG files are never linear, set its colour to "srgb"')
+        raise InputError(f'{who}: JPEG files are never linear, set its colour to "srgb"')
     weight = np.ones(image.shape[:2], np.float32)
     if image.shape[2] in (2, 4):
         if target.alpha:
             weight = np.clip(np.nan_to_num(image[:, :, -1]), 0, 1)
         image = image[:, :, :-1]
     elif target.alpha:
-        raise ValueError(f"{who} has no alpha channel")
+        raise InputError(f"{who} has no alpha channel")
     if target.mask is not None:
         mask, _ = read_picture(target.mask)
         if mask.shape[:2] != image.shape[:2]:
             if not target.resize:
-                raise ValueError(
+                raise InputError(
                     f'fit: mask "{_name(target.mask)}" has {mask.shape[1]} x {mask.shape[0]} pixels, '
                     f"the picture {image.shape[1]} x {image.shape[0]}"
                 )
@@ -71,19 +72,19 @@ def read(target: Target, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
         weight = weight * np.clip(mask[:, :, 0], 0, 1)
     bad = (weight > 0) & ~np.isfinite(image).all(axis=2)
     if bad.any():
-        raise ValueError(f"{who} has {bad.sum()} pixels that are not finite; repair it, or exclude them by a mask")
+        raise InputError(f"{who} has {bad.sum()} pixels that are not finite; repair it, or exclude them by a mask")
     image = np.where(weight[..., None] > 0, image, np.float32(0))
     if colour == "srgb":
         image = srgb_to_linear(image)
     if image.shape[:2] != size:
         if not target.resize:
-            raise ValueError(
+            raise InputError(
                 f"{who} has {image.shape[1]} x {image.shape[0]} pixels, the film {size[1]} x {size[0]}; "
                 "set resize to resample it"
             )
         image, weight = smaller(image, weight, size)
     if not weight.any():
-        raise ValueError(f"{who}: no pixel counts, mask and alpha are 0 everywhere")
+        raise InputError(f"{who}: no pixel counts, mask and alpha are 0 everywhere")
     return image.astype(np.float32), weight.astype(np.float32)
 
 
@@ -112,7 +113,7 @@ def read_picture(source: Any) -> tuple[np.ndarray, bool]:
     except (OSError, ValueError, SyntaxError, RuntimeError) as error:
         raise OSError(f'fit: cannot read "{path}": {one_line(error)}') from None
     if not np.issubdtype(image.dtype, np.unsignedinteger):
-        raise ValueError(f'fit: "{path.name}" is no picture of 8 or 16 bits a channel')
+        raise InputError(f'fit: "{path.name}" is no picture of 8 or 16 bits a channel')
     return _decoded(image, path.name)
 
 
@@ -121,7 +122,7 @@ def _decoded(image: np.ndarray, name: str) -> tuple[np.ndarray, bool]:
     if image.ndim == 2:
         image = image[:, :, None]
     if image.ndim != 3 or image.shape[2] > 4:
-        raise ValueError(f'fit: "{name}" is no picture of 1 to 4 channels, its shape is {image.shape}')
+        raise InputError(f'fit: "{name}" is no picture of 1 to 4 channels, its shape is {image.shape}')
     if not np.issubdtype(image.dtype, np.unsignedinteger):
         return image.astype(np.float32), False
     return (image / np.iinfo(image.dtype).max).astype(np.float32), True

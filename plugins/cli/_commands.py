@@ -16,11 +16,11 @@ import rimlight
 from rimlight import pictures
 from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
 from rimlight.exr import write_exr
-from rimlight.loading import InputError, expected, load_integrator, use_variant
+from rimlight.loading import InputError, load_integrator, use_variant
 
 from . import _loading
 from ._loading import at_least
-from ._shared import REFUSAL, OnMotion, OnScene, OnSensor, accumulate, progress, seeds, write_image, writing
+from ._shared import OnMotion, OnScene, OnSensor, accumulate, progress, seeds, write_image, writing
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,7 @@ class PlanCommand(OnSensor):
             for key, _, _ in _loading.differentiable(scene)
             if key.endswith("vertex_positions") or key == _loading.camera_key(scene, self.sensor)
         ]
-        with expected(ValueError, RuntimeError, pattern=REFUSAL):
-            print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
+        print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
         return 0
 
 
