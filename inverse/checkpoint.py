@@ -18,6 +18,9 @@ from rimlight.exr import replacing
 #: Of the file's layout.
 VERSION = 2
 
+#: Of compression: 1 is as good as 6 for numbers of optimisers (7 % of 50 MB), and takes two thirds of the time.
+LEVEL = 1
+
 
 def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
     """Write a checkpoint in place of the last one, which stays until this one is complete.
@@ -30,7 +33,10 @@ def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any])
     """
     text = json.dumps({**facts, "version": VERSION})
     with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **{f"array/{name}": array for name, array in arrays.items()}, facts=np.array(text))
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
+            for name, array in {"facts": np.array(text), **{f"array/{k}": a for k, a in arrays.items()}}.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as part:
+                    np.lib.format.write_array(part, np.asanyarray(array), allow_pickle=False)
         file.flush()
         os.fsync(file.fileno())
 

@@ -17,14 +17,14 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from rimlight.loading import InputError, use_variant
+from rimlight.loading import InputError
 
-from . import free_parameters, progress, targets
+from . import free_parameters, progress, sources, targets
 from . import problem as problems
 from . import result as results
 from .free_parameters import to_numpy
 from .optimisers import Optimiser
-from .problem import Problem, Stage
+from .problem import Problem
 from .progress import Progress, Segment, Step
 from .regularisers import Regulariser
 from .renderer import Gradient, Renderer, Task, alone, derived_seed
@@ -101,7 +101,6 @@ class Fit:
         self.status = "running"
         if tensorboard and self.file is None:
             raise InputError("fit: to write a log for TensorBoard, name a folder")
-        use_variant(self.problem.variant)
         with alone(self.problem.variant):
             self._prepare(executor)
             self._board = _board(self.file.parent) if tensorboard else None
@@ -121,6 +120,7 @@ class Fit:
         if problem.threads is not None:
             dr.set_thread_count(problem.threads)
         self.renderer = Renderer(problem)
+        self.fingerprints = sources.fingerprints(problem, self.renderer.scenes)
         for view in self.renderer.views:
             for stage in range(len(problem.stage)):
                 view.check(stage)
@@ -230,7 +230,7 @@ class Fit:
             self._doubt({task.target: f.image for task, f in zip(tasks, found, strict=True)})
         self._note(loss, metrics)
         errors = {label: known[-1] for label, known in now.errors.items()}
-        rate = self._rate(stage, now.iteration)
+        rate = stage.factor(now.iteration)
         good = bool(np.isfinite(loss)) and all(np.isfinite(g).all() for g in gradients.values())
         if good:
             for parameter in self.parameters:
@@ -263,12 +263,6 @@ class Fit:
             free = ", ".join(attached)
             raise InputError(f"fit: a regulariser asks for {error}, which is not free; free are {free}") from None
         return sum((dr.sum(part.array if dr.is_tensor_v(part) else part) for part in parts), mi.Float(0))
-
-    @staticmethod
-    def _rate(stage: Stage, iteration: int) -> float:
-        """Factor of all rates in a step of a stage."""
-        first = stage.rate(iteration) if callable(stage.rate) else stage.rate
-        return float(first * stage.decay ** (iteration / max(stage.iterations - 1, 1)))
 
     def silent(self) -> list[str]:
         """Names of parameters whose gradient was always 0."""
@@ -410,7 +404,7 @@ class Fit:
             progress.save(Path(file), self.progress, self.optimiser.state(), self._belongs())
 
     def _belongs(self) -> dict[str, Any]:
-        return progress.belongs(self.problem, self.renderer.fingerprints)
+        return progress.belongs(self.problem, self.fingerprints)
 
     def load(self, file: Path | str) -> None:
         """Go on from a checkpoint of the same fit. Its files may have moved, but must hold the same.

@@ -129,6 +129,11 @@ class Stage:
     norm: Norm | None = None
     """Norm of the loss in this stage. Default: that of the loss of the problem."""
 
+    def factor(self, iteration: int) -> float:
+        """Factor of all rates in a step of the stage."""
+        first = self.rate(iteration) if callable(self.rate) else self.rate
+        return float(first * self.decay ** (iteration / max(self.iterations - 1, 1)))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Starts:

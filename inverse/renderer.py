@@ -1,8 +1,7 @@
 """Loss and gradient of one view of a problem, as a pure function of NumPy arrays: what processes and machines share.
 
-The picture is rendered, compared with the target on the host, and the derivative of the loss
-with respect to its pixels weighs a second, independent render, backward. Both are recorded once and replayed
-(`dr.freeze`) where that is possible.
+The picture is rendered, compared with the target on the host, and the derivative of the loss with respect to its pixels
+weighs a second, independent render, backward. Both are recorded once and replayed (`dr.freeze`) where that is possible.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ class Renderer:
 
     params : of all scenes, key -> value; where several scenes have a key, that of the first.
     losses : of each stage.
-    fingerprints : see `sources.fingerprints`.
+    scenes : the loaded ones, by `sources.key`.
 
     Raises
     ------
@@ -101,13 +100,12 @@ class Renderer:
         used = [problem.scene if target.scene is None else target.scene for target in problem.target]
         gc.collect()  # as long as a scene that nobody needs exists, its materials are in all kernels that are compiled
         # Every load of a scene costs memory that never comes back.
-        scenes = {sources.key(s): sources.scene(s, problem.define) for s in {sources.key(s): s for s in used}.values()}
-        self.fingerprints = sources.fingerprints(problem, scenes)
+        self.scenes = {key: sources.scene(s, problem.define) for key, s in {sources.key(s): s for s in used}.items()}
         # One for each: ours remember the edges of the last scene.
-        integrators = {key: load_integrator(kind, **options) for key in scenes}
-        self.views = [View(self, i, scenes[k], integrators[k]) for i, k in enumerate(map(sources.key, used))]
+        integrators = {key: load_integrator(kind, **options) for key in self.scenes}
+        self.views = [View(self, i, self.scenes[k], integrators[k]) for i, k in enumerate(map(sources.key, used))]
         self.params = {}
-        for scene in scenes.values():
+        for scene in self.scenes.values():
             self.params = dict(mi.traverse(scene).items()) | self.params
 
     def image(self, values: Mapping[str, np.ndarray], task: Task) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -88,8 +89,9 @@ def _of_scene_file(path: Path, define: Mapping[str, str]) -> str:
         digest.update(f"{node.type} {said.plugin_name()} {said.id()}".encode())
         for name in sorted(said.keys()):
             text = said.as_string(name)
-            if said.type(name) == mi.Properties.Type.String and (file := path.parent / text.strip('"')).is_file():
-                text = _of_file(file)  # where a mesh or a picture lies does not matter, but what is in it
+            # Where a mesh or a picture lies does not matter, but what is in it.
+            if said.type(name) == mi.Properties.Type.String and os.path.isfile(path.parent / said[name]):
+                text = _of_file(path.parent / said[name])
             digest.update(f" {name} {text}".encode())
     return digest.hexdigest()
 

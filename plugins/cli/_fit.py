@@ -65,12 +65,13 @@ class Fit:
             found = inverse.fit(
                 problem, out=self.out, resume=self.resume, executor=executor, tensorboard=self.tensorboard
             )
+            _print(found)
             inverse.write(self.out, found, title=self.config.stem)
-        _print(found, self.out)
+        print(f"report: {self.out / 'report.html'}")
         return {"finished": 0, "out of time": 0, "interrupted": 130}.get(found.status, 1)
 
 
-def _print(found: inverse.Result, out: Path) -> None:
+def _print(found: inverse.Result) -> None:
     print(f"{found.status}: {len(found.losses)} steps in {found.seconds:.1f} s")
     for label, errors in found.errors.items():
         print(f"  {label}: {errors[0]:.4g} -> {errors[-1]:.4g}")
@@ -83,7 +84,6 @@ def _print(found: inverse.Result, out: Path) -> None:
         print(f"  {found.skipped} steps were left out: a number would not have been finite")
     for name in found.silent:
         print(f'  "{name}" has no influence on the pictures')
-    print(f"report: {out / 'report.html'}")
 
 
 def command(argv: Sequence[str]) -> Any:

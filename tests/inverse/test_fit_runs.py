@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+import types
 import zipfile
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from rimlight.cli import main
 from rimlight.inverse import checkpoint, executors, fitting, progress, report
 from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Starts, Target
-from rimlight.inverse.renderer import Renderer, Task
+from rimlight.inverse.renderer import Gradient, Renderer, Task
 from rimlight.inverse.result import Result
 
 GREEN, RED, COLOUR = "green.vertex_positions", "red.vertex_positions", "green.bsdf.reflectance.value"
@@ -222,7 +223,7 @@ def test_a_full_disk_stops_the_fit(tmp_path, monkeypatch):
     next(steps), next(steps)
     first = (tmp_path / "checkpoint.npz").read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint.np, "savez_compressed", full)
+        patch.setattr(checkpoint.np.lib.format, "write_array", full)
         found = run.run(progress=False)
     assert len(found.losses) == 3 and len(found.views) == 1
     assert re.fullmatch(
@@ -230,6 +231,26 @@ def test_a_full_disk_stops_the_fit(tmp_path, monkeypatch):
     )
     assert (tmp_path / "checkpoint.npz").read_bytes() == first
     assert fit(triangles(), out=tmp_path, resume=True).status == "finished"
+
+
+def test_checkpoints_take_a_twentieth_of_the_time(tmp_path, monkeypatch):
+    """With a clock of our own: a step takes 1 s, and a checkpoint 2 s, which every 5 s would be too much."""
+    now, written = [0.0], []
+    monkeypatch.setattr(fitting, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    run = fitting.Fit(triangles(MATERIAL, steps=100), out=tmp_path)
+
+    def executor(values, tasks):
+        now[0] += 1
+        return [Gradient(1.0, {COLOUR: np.zeros(3, np.float32)}, np.zeros((16, 16, 3), np.float32)) for _ in tasks]
+
+    def save(file):
+        now[0] += 2
+        written.append(run.progress.step)
+
+    run.executor, run.save = executor, save
+    assert len(list(run)) == 100
+    assert written[0] == 6 and written[1] - written[0] == 41  # the first one tells what they cost
+    assert written[-1] == 100 and 2 * (len(written) - 1) <= 0.05 * 100 + 2
 
 
 def test_a_report_is_written_with_what_fits(tmp_path, monkeypatch):

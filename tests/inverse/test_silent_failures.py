@@ -21,14 +21,14 @@ pytestmark = pytest.mark.usefixtures("no_derivative_image")
 GREEN, COLOUR = "green.vertex_positions", "green.bsdf.reflectance.value"
 MATERIAL = Free(key=(COLOUR,), kind="material", rate=0.02, start=(0.2,))
 
-#: With a mesh and a texture in files of their own.
+#: With a mesh and a texture in files of their own, and a text that is too long for the name of one.
 SCENE = """<scene version="3.0.0">
     <integrator type="direct"/>
     <sensor type="perspective" id="camera">
         <transform name="to_world"><lookat origin="0, 0, -5" target="0, 0, 0" up="0, 1, 0"/></transform>
         <film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="12"/></film>
     </sensor>
-    <emitter type="constant"/>
+    <emitter type="constant"><spectrum name="radiance" value="LONG"/></emitter>
     <shape type="ply" id="body">
         <string name="filename" value="meshes/body.ply"/>
         <bsdf type="twosided"><bsdf type="diffuse">
@@ -43,7 +43,7 @@ def write_scene(folder: Path) -> Path:
     (folder / "meshes").mkdir(parents=True)
     shutil.copy(scenes.path("two_triangles").parent / "meshes" / "torus.ply", folder / "meshes" / "body.ply")
     shutil.copy(scenes.path("two_triangles").parent / "textures" / "tiles.png", folder / "tiles.png")
-    (folder / "scene.xml").write_text(SCENE)
+    (folder / "scene.xml").write_text(SCENE.replace("LONG", ", ".join(f"{n}:1" for n in range(400, 700, 5))))
     write_exr(folder / "target.exr", {"": np.full((12, 12, 3), 0.3, np.float32)})
     write_exr(folder / "mask.exr", {"": np.ones((12, 12, 1), np.float32)})
     return folder
