@@ -270,4 +270,4 @@ def _rebuilt(tree: Any, leaves: Iterator[np.ndarray]) -> Any:
     array = next(leaves)
     if dr.is_array_v(tree):
         return _own(array) if dr.is_float_v(tree) else type(tree)(array)
-    return array if isinstance(tree, np.ndarray) else type(tree)(array.item()) if np.ndim(array) == 0 else array
+    return type(tree)(array.item()) if isinstance(tree, int | float) else array

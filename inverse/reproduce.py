@@ -30,7 +30,7 @@ from . import classifier, report
 from . import problem as problems
 from .fitting import fit
 from .problem import Problem
-from .result import Result
+from .result import Result, finite
 
 log = logging.getLogger(__name__)
 
@@ -143,7 +143,8 @@ def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None
     folder = out / name / f"{method}_{seed}"
     file = folder / "outcome.json"
     if file.exists():
-        return Outcome(**json.loads(file.read_text("utf-8")))
+        said = json.loads(file.read_text("utf-8"))
+        return Outcome(**{name: float("nan") if value is None else value for name, value in said.items()})
     problem = dataclasses.replace(problem_of(name, out / name), seed=seed)
     if method == PEER:
         depth = problem.integrator.get("max_depth", 2 if problem.integrator["type"] == "direct_edge" else -1)
@@ -162,7 +163,7 @@ def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None
         outcome = _judge(name, seed, method, found)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(file) as temporary:
-        temporary.write_text(json.dumps(dataclasses.asdict(outcome)), "utf-8")
+        temporary.write_text(json.dumps(finite(dataclasses.asdict(outcome)), allow_nan=False), "utf-8")
     del found
     gc.collect()
     dr.flush_malloc_cache()
@@ -211,7 +212,7 @@ def _judge(name: str, seed: int, method: str, found: Result) -> Outcome:
 def write_summary(out: Path, outcomes: Sequence[Outcome]) -> None:
     """`summary.json`, `summary.md`, and `convergence.png`: losses over time."""
     with replacing(out / "summary.json") as temporary:
-        temporary.write_text(json.dumps([dataclasses.asdict(o) for o in outcomes]), "utf-8")
+        temporary.write_text(json.dumps(finite(list(map(dataclasses.asdict, outcomes))), allow_nan=False), "utf-8")
     with replacing(out / "summary.md") as temporary:
         temporary.write_text("\n".join(table(outcomes)) + "\n", "utf-8")
     write_convergence(out / "convergence.png", outcomes)

@@ -182,7 +182,7 @@ def _truth(fit: Fit) -> dict[str, np.ndarray]:
 def summary(result: Result) -> str:
     """A result in JSON: settings apart, everything but pictures and long arrays. What is not finite is null."""
     return json.dumps(
-        _finite(
+        finite(
             {
                 "status": result.status,
                 "steps": len(result.losses),
@@ -202,9 +202,10 @@ def summary(result: Result) -> str:
     )
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """What JSON can say of it: None instead of numbers that are not finite."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
