@@ -121,8 +121,10 @@ class Fit:
             dr.set_thread_count(problem.threads)
         self.renderer = Renderer(problem)
         self.fingerprints = sources.fingerprints(problem, self.renderer.scenes)
+        # Stages of one resolution and loss need one check.
+        distinct = {(s.resolution, id(n)): i for i, (s, n) in enumerate(zip(problem.stage, problem.norms, strict=True))}
         for view in self.renderer.views:
-            for stage in range(len(problem.stage)):
+            for stage in distinct.values():
                 view.check(stage)
         self.parameters = free_parameters.find(problem.free, self.renderer.params)
         self.truth_is_known = problem.compares and all(target.file is None for target in problem.target)
@@ -144,10 +146,9 @@ class Fit:
 
         Ctrl-C ends the fit after the present step, with a result; pressed twice, at once.
         """
-        now = self.progress
         with (
             self._listening(),
-            tqdm(total=self.total, initial=now.step, desc="fit", disable=None if progress else True) as bar,
+            tqdm(total=self.total, initial=self.progress.step, desc="fit", disable=None if progress else True) as bar,
         ):
             for _ in self:
                 bar.update()
@@ -159,15 +160,17 @@ class Fit:
     def __iter__(self) -> Iterator[Step]:
         """Take the steps that are left, one by one. A checkpoint is written now and then, and when the loop is left."""
         self._clock_starts()
-        try:
-            while self.status == "running" and self.progress.segment < len(self.plan):
-                step = self.step()
-                self._settle()
+        while self.status == "running" and self.progress.segment < len(self.plan):
+            step = self.step()
+            self._settle()
+            try:
                 yield step
-            if self.status == "running":
-                self.status = "finished"
-        finally:
-            self._save()
+            except GeneratorExit:  # the loop was left by break; not in the middle of a step
+                self._save()
+                raise
+        if self.status == "running":
+            self.status = "finished"
+        self._save()
 
     def step(self) -> Step:
         """Take one step of the plan, and tell the functions of `on_step`."""
@@ -280,7 +283,8 @@ class Fit:
         """Keep what is known before a step."""
         now = self.progress
         latents = self.latents()
-        self.note_errors(latents)
+        for label, error in self.errors(latents).items():
+            now.errors.setdefault(label, []).append(error)
         every = -(-self.total // FRAMES)
         if now.step % every == 0:
             now.frames.append((now.step, latents))
@@ -294,12 +298,10 @@ class Fit:
             if mean < now.best_loss:
                 now.best_loss, now.best_error, now.best = mean, error, latents
 
-    def note_errors(self, latents: dict[str, np.ndarray]) -> None:
-        """Keep the distance from the truth, where that is known."""
-        if self.truth_is_known:
-            for parameter in self.parameters:
-                for label, error in parameter.errors(latents).items():
-                    self.progress.errors.setdefault(label, []).append(error)
+    def errors(self, latents: dict[str, np.ndarray]) -> dict[str, float]:
+        """Distance from the truth, label -> number, where that is known."""
+        parameters = self.parameters if self.truth_is_known else []
+        return {label: error for p in parameters for label, error in p.errors(latents).items()}
 
     def _stalls(self) -> bool:
         now = self.progress

@@ -55,7 +55,7 @@ class Progress:
 
     segment, iteration : place in the plan. step : of all.
     losses, segments, times : of each step; the last in seconds, at its end.
-    errors : label -> one number before each step, and one at the end, if the truth is known.
+    errors : label -> distance from the truth before each step, if the truth is known.
     scores : label -> metric of the loss at the render of each step, the mean of the tasks; NaN where a step had none.
     frames : (step, latents) for an animation, of this process; they are not in a checkpoint.
     skipped : steps that were left out, since a number was not finite; bad : of them, without another one since.

@@ -106,7 +106,6 @@ def of(fit: Fit) -> Result:
         if now.found and min(loss for loss, _ in now.found) < fit.recent()[0]:
             fit.restart_at_best_start()
     latents = fit.latents()
-    fit.note_errors(latents)
     start, values, truth = (fit.values(at) for at in (fit.start, latents, _truth(fit)))
     render, views, measures, floors = fit.renderer.image, [], [], []
     for i, view in enumerate(fit.renderer.views):
@@ -137,7 +136,7 @@ def of(fit: Fit) -> Result:
         losses=np.array(now.losses),
         segments=np.array(now.segments),
         times=np.array(now.times),
-        errors={label: np.array(errors) for label, errors in now.errors.items()},
+        errors={label: np.array([*now.errors.get(label, []), last]) for label, last in fit.errors(latents).items()},
         silent=fit.silent() if now.step else [],
         skipped=now.skipped,
         seconds=now.seconds,

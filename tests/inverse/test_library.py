@@ -358,6 +358,30 @@ def test_a_loop_is_a_run():
     assert looped.status == found.status == "finished" and list(looped) == []
 
 
+def test_a_result_may_be_asked_for_at_any_time():
+    fit = inverse.Fit(posed())
+    steps = iter(fit)
+    next(steps)
+    for _ in range(2):
+        early = fit.result()
+        assert early.status == "running" and len(early.losses) == 1 and len(early.errors[RELATIVE]) == 2
+    assert len(list(steps)) == 3
+    assert len(fit.result().errors[RELATIVE]) == 5
+
+
+def test_a_step_that_fails_leaves_the_last_checkpoint(tmp_path):
+    fit = inverse.Fit(posed(), out=tmp_path)
+    before = (tmp_path / "checkpoint.npz").read_bytes()
+    steps = iter(fit)
+    next(steps)
+    fit.optimiser.step = lambda *_: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        next(steps)
+    steps.close()
+    assert (tmp_path / "checkpoint.npz").read_bytes() == before
+    assert len(inverse.fit(posed(), out=tmp_path, resume=True, progress=False).losses) == 4
+
+
 def test_functions_are_called_at_each_step_and_may_stop_the_fit():
     seen = []
     fit = inverse.Fit(posed(), on_step=[seen.append])
