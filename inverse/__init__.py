@@ -17,6 +17,7 @@ from .regularisers import prior, smooth_mesh, smooth_texture
 from .report import write, write_report
 from .result import Result, ViewOfFit
 from .torch_bridge import torch_loss, torch_render
+from .watching import Watch
 
 __all__ = [
     "Cluster",
@@ -32,6 +33,7 @@ __all__ = [
     "Step",
     "Target",
     "ViewOfFit",
+    "Watch",
     "drjit_loss",
     "fit",
     "prior",

@@ -29,6 +29,7 @@ from .progress import Progress, Segment, Step
 from .regularisers import Regulariser
 from .renderer import Gradient, Renderer, Task, alone, derived_seed
 from .result import WINDOW, Result
+from .tensorboard import TensorBoard
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +68,7 @@ class Fit:
     tensorboard : write loss and errors into `out` for TensorBoard. Needs the package tensorboardX.
     regularisers : functions of the fitted scene parameters that are added to the loss; see `regularisers`.
     on_step : functions that are called with the `Step` after each one. The method of the same name adds more of them.
+        If one has a method `close`, `run` calls it at the end.
 
     Attributes
     ----------
@@ -103,7 +105,8 @@ class Fit:
             raise InputError("fit: to write a log for TensorBoard, name a folder")
         with alone(self.problem.variant):
             self._prepare(executor)
-            self._board = _board(self.file.parent) if tensorboard else None
+            if tensorboard:
+                self._callbacks.append(TensorBoard(self.file.parent))
             if resume:
                 if self.file is None:
                     raise InputError("fit: to resume, name the folder that holds the checkpoint")
@@ -136,6 +139,8 @@ class Fit:
         self.plan = [*explored, *(Segment(*entry) for entry in stages[1:])]
         self.total = sum(segment.stage.iterations for segment in self.plan)
         self.progress = Progress()
+        self.before: np.ndarray | None = None
+        self.image: np.ndarray | None = None
         self._began, self._before = None, 0.0
         self._saved, self._cost = 0.0, 0.0  # when the last checkpoint was written, and how long that took, seconds
 
@@ -153,8 +158,9 @@ class Fit:
             for _ in self:
                 bar.update()
                 bar.set_postfix(self._shown(), refresh=False)
-        if self._board is not None:
-            self._board.close()
+        for callback in self._callbacks:
+            if hasattr(callback, "close"):
+                callback.close()
         return self.result()
 
     def __iter__(self) -> Iterator[Step]:
@@ -232,6 +238,7 @@ class Fit:
         if now.step == 0:
             self._doubt({task.target: f.image for task, f in zip(tasks, found, strict=True)})
         self._note(loss, metrics)
+        self._show(found[0].image)
         errors = {label: known[-1] for label, known in now.errors.items()}
         rate = stage.factor(now.iteration)
         good = bool(np.isfinite(loss)) and all(np.isfinite(g).all() for g in gradients.values())
@@ -242,10 +249,6 @@ class Fit:
             good = self.optimiser.step(attached, gradients, rate, penalty)
         now.bad = 0 if good else now.bad + 1
         now.skipped += not good
-        if self._board is not None:
-            self._board.add_scalar("loss", loss, now.step)
-            for label, number in (errors | metrics).items():
-                self._board.add_scalar(label, number, now.step)
         step = Step(now.step, segment.number, now.iteration, loss, metrics, errors, rate, not good)
         now.step += 1
         now.iteration += 1
@@ -255,6 +258,11 @@ class Fit:
         if now.iteration >= stage.iterations or self._stalls():
             self._next_segment()
         return step
+
+    def _show(self, image: np.ndarray) -> None:
+        """Keep the first and the last picture of the first view that have the present size, for who watches."""
+        self.before = image if self.before is None or self.before.shape != image.shape else self.before
+        self.image = image
 
     def _penalty(self, attached: Mapping[str, Any]) -> Any:
         """The sum of the regularisers, attached, or None if there are none."""
@@ -438,13 +446,3 @@ class Fit:
                 self.status = f"stopped: {error} ({free / 1e6:.3g} MB are free there)"
         self._saved = time.monotonic()
         self._cost = self._saved - began
-
-
-def _board(folder: Path) -> Any:
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        raise InputError(
-            "fit: a log for TensorBoard needs the package tensorboardX: pip install tensorboardX"
-        ) from None
-    return SummaryWriter(str(folder))

@@ -81,6 +81,12 @@ def _write_values(path: Path, values: Mapping[str, np.ndarray]) -> None:
         np.savez(temporary, **values)
 
 
+def live(result: Result, *, title: str) -> str:
+    """A page about a fit that goes on."""
+    sections = [f"<header>\n<h1>{html.escape(title)}</h1>\n{_verdict(result)}\n</header>", _views(result)]
+    return page.page(title, "\n".join([*sections, _curves(result), _parameters(result)]))
+
+
 def brief(result: Result) -> str:
     """How a fit went, in a piece of HTML: one line, and the pictures of the first view."""
     view = result.views[0]
@@ -138,7 +144,7 @@ def _verdict(result: Result) -> str:
         before, after = result.errors[worst][[0, -1]]
         facts.append(f"{_without_unit(worst)} {number(before)} → {number(after)} {unit}".rstrip())
     status, rest = html.escape(result.status.partition(":")[0]), html.escape("; ".join(facts))
-    kind = "status" if finished else "status bad"
+    kind = "status" if result.status in ("finished", "running") else "status bad"
     line = f'<p class="verdict"><span class="{kind}">{status}</span>: {rest}</p>'
     if found := _warnings(result):
         items = "\n".join(f"<li>{html.escape(text)}</li>" for text in found)
@@ -148,7 +154,7 @@ def _verdict(result: Result) -> str:
 
 def _warnings(result: Result) -> list[str]:
     found = []
-    if result.status != "finished":
+    if result.status not in ("finished", "running"):
         found.append(f"The fit did not finish: {result.status}. The result is the best that it had seen by then.")
     if result.silent:
         names = ", ".join(f"“{name}”" for name in result.silent)

@@ -127,10 +127,41 @@ def of(fit: Fit) -> Result:
     except RuntimeError as error:  # of an integrator that cannot; what was found is not lost by that
         log.warning("there is no derivative image: %s", one_line(error))
     render(values, Task(0, None, 1, 0))  # leave the scene at the result
+    return _result(
+        fit,
+        latents,
+        values=values,
+        views=views,
+        measures=measures,
+        floors=floors,
+        derivative=derivative,
+        frames=frames,
+    )
+
+
+def so_far(fit: Fit) -> Result:
+    """The result of a fit that goes on, without a render: with the noisy pictures of its first and last step."""
+    view = fit.renderer.views[0]
+    target, weight = view.target_at(fit.image.shape[:2])
+    error = [losses.root_mean_square(image - target, weight) for image in (fit.before, fit.image)]
+    latents = fit.latents()
+    return _result(
+        fit,
+        latents,
+        values=fit.values(latents),
+        views=[ViewOfFit(fit.before, fit.image, target, weight)],
+        measures=[{"root mean square error": (error[0], error[1])}],
+        floors=[],
+        derivative=None,
+        frames=[],
+    )
+
+
+def _result(fit: Fit, latents: dict[str, np.ndarray], **pictures: Any) -> Result:
+    now = fit.progress
     return Result(
         problem=fit.problem,
         status=fit.status,
-        values=values,
         latents=latents,
         start=fit.start,
         losses=np.array(now.losses),
@@ -140,14 +171,10 @@ def of(fit: Fit) -> Result:
         silent=fit.silent() if now.step else [],
         skipped=now.skipped,
         seconds=now.seconds,
-        views=views,
-        measures=measures,
-        floors=floors,
-        derivative=derivative,
-        frames=frames,
         scores={label: np.array(scores) for label, scores in now.scores.items()},
         doubts=list(now.doubts),
         loss=", then ".join(dict.fromkeys(map(losses.label, fit.renderer.losses))),
+        **pictures,
     )
 
 

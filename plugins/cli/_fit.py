@@ -39,6 +39,8 @@ class Fit:
     """Number of processes that share the work. 0: this process does all of it."""
     cluster: str | None = None
     """Address of the scheduler of a Dask cluster, or "local"."""
+    watch: bool = False
+    """Show the report while the fit runs, on a page that only this machine can open. Its address is printed."""
     tensorboard: bool = False
     """Write a log for TensorBoard into the folder."""
     problem: Annotated[Problem, arg(name="")] = EXAMPLE
@@ -62,9 +64,13 @@ class Fit:
                 executor = stack.enter_context(inverse.Cluster(problem, self.cluster))
             elif self.workers:
                 executor = stack.enter_context(inverse.Processes(problem, self.workers))
-            found = inverse.fit(
+            fit = inverse.Fit(
                 problem, out=self.out, resume=self.resume, executor=executor, tensorboard=self.tensorboard
             )
+            if self.watch:
+                watch = stack.enter_context(inverse.Watch(fit, title=self.config.stem))
+                print(f"watch: {watch.url}", flush=True)
+            found = fit.run()
             _print(found)
             inverse.write(self.out, found, title=self.config.stem)
         print(f"report: {self.out / 'report.html'}")
