@@ -86,8 +86,9 @@ def torch_render(
     torch = _torch()
     options = {"type": integrator} if isinstance(integrator, str) else dict(integrator)
     source = str(scene) if not isinstance(scene, mi.Scene) else scene
-    with alone(mi.variant()):
-        renderer = _renderer(source, mi.variant(), sensor, tuple(sorted(options.items())))
+    variant = mi.variant() or Problem.variant
+    with alone(variant):
+        renderer = _renderer(source, variant, sensor, tuple(sorted(options.items())))
     for key, value in params.items():
         if key not in renderer.params:
             raise InputError(f'torch_render: the scene has no parameter "{key}"')

@@ -73,6 +73,11 @@ def test_seeds(scene):
     assert torch.equal(image(1), image(1)) and not torch.equal(image(1), image(2))
 
 
+def test_a_scene_may_be_a_file():
+    image = torch_render(scenes.path("two_triangles"), {COLOUR: torch.zeros(3)}, spp=1, integrator={"type": "direct"})
+    assert image.shape == (64, 64, 3)
+
+
 def test_what_does_not_fit_is_refused(scene):
     with pytest.raises(ValueError, match=r'^torch_render: the scene has no parameter "gren"$'):
         torch_render(scene, {"gren": torch.zeros(3)}, **OPTIONS)
