@@ -40,7 +40,7 @@ def one_line(error: Exception) -> str:
     text = str(error).strip()
     head, traceback, tail = text.partition("Traceback (most recent call last):")
     if traceback:  # a plugin in Python failed: its last line says why
-        text = head + re.sub(r"^\w+(Error|Exception): ", "", tail.strip().splitlines()[-1])
+        text = head + re.sub(r"^(\w+Error|\w+Exception|Refusal): ", "", tail.strip().splitlines()[-1])
     text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", text).split())
     for pattern, hint in HINTS.items():
         if re.search(pattern, text):

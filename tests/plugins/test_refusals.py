@@ -37,3 +37,14 @@ def test_refusals_are_one_line_and_defects_are_not(monkeypatch, capsys, error):
         return
     assert main(arguments) == 2
     assert capsys.readouterr().err == "rimlight: error: who: what\n"
+
+
+@pytest.mark.parametrize("kind", [InputError, Refusal])
+def test_refusals_of_plugins_reach_the_user_without_their_class(kind):
+    """Mitsuba wraps what their constructors raise into a text."""
+    from rimlight.loading import one_line
+
+    error = RuntimeError(
+        f'[a.cpp:1] At "x": Traceback (most recent call last):\n  File "y"\n{kind.__name__}: who: what\n'
+    )
+    assert one_line(error) == 'At "x": who: what'
