@@ -210,6 +210,25 @@ def test_two_fits_in_two_threads():
         np.testing.assert_allclose(found[seed].losses, expected.losses, rtol=1e-4)
 
 
+def test_steps_of_two_fits_alternate_in_two_threads():
+    """Each records what depends on what the other one has just made."""
+    here, there = inverse.Fit(triangles(seed=1)), inverse.Fit(triangles(seed=2))
+    steps: list[object] = []
+
+    def step() -> None:
+        try:
+            steps.append(there.step())
+        except RuntimeError as error:
+            steps.append(error)
+
+    for _ in range(3):
+        steps.append(here.step())
+        thread = threading.Thread(target=step)
+        thread.start()
+        thread.join()
+    assert [type(step) for step in steps] == 6 * [inverse.Step], steps
+
+
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_start_that_is_not_finite_is_said(bad):
     posed = triangles(free=Free(key=GREEN, kind="pose", start=(0, 0, 0, 0, 0, bad)))

@@ -51,6 +51,24 @@ def test_gradient_is_that_of_differences(scene, along):
     assert error < 0.05 * abs(np.mean(found))
 
 
+def test_noise_does_not_bias_the_gradient_of_squares(scene):
+    """Light is linear in a colour: the derivative of Σ Ī² with respect to its logarithm is 2 Σ Ī², where only it shines.
+    With the same random numbers in both renders, it would be that of E[Σ I²]."""
+    base = parameters(scene)
+    black = {**base, "red.bsdf.reflectance.value": torch.zeros(3)}
+    found, squares = [], []
+    for seed in range(150):
+        factor = torch.tensor(1.0, requires_grad=True)
+        image = torch_render(scene, {**black, COLOUR: factor * base[COLOUR]}, spp=1, seed=seed, **OPTIONS)
+        (image**2).sum().backward()
+        found.append(factor.grad.item())
+        squares.append(2 * (image**2).sum().item())
+    converged = 2 * (torch_render(scene, {**black, COLOUR: base[COLOUR]}, spp=16384, **OPTIONS) ** 2).sum().item()
+    error = np.std(found, ddof=1) / np.sqrt(len(found))
+    assert abs(np.mean(found) - converged) < 4 * error
+    assert np.mean(squares) - converged > 10 * error  # the noise would be seen
+
+
 def test_it_is_a_layer(scene):
     """Between others, of other shapes and precisions; used twice in a graph, each time with its own parameters."""
     base = parameters(scene)
