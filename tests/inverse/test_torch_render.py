@@ -52,7 +52,7 @@ def test_gradient_is_that_of_differences(scene, along):
 
 
 def test_noise_does_not_bias_the_gradient_of_squares(scene):
-    """Light is linear in a colour: the derivative of Σ Ī² with respect to its logarithm is 2 Σ Ī², if all else is black.
+    """Light is linear in a colour, if all else is dark: the derivative of Σ Ī² with respect to its logarithm is 2 Σ Ī².
     With the same random numbers in both renders, it would be that of E[Σ I²]."""
     base = parameters(scene)
     black = {**base, "red.bsdf.reflectance.value": torch.zeros(3)}
