@@ -9,23 +9,39 @@ inverse.write("result", found, title="My fit")
 """
 
 from .executors import Cluster, Processes
-from .fitting import Fit, ViewOfFit, fit
-from .problem import Free, Loss, Problem, Stage, Starts, Target, read
+from .fitting import Fit, fit
+from .losses import Loss, LossFunction, drjit_loss
+from .problem import Free, Problem, Stage, Starts, Target, read
+from .progress import Step
+from .regularisers import prior, smooth_mesh, smooth_texture
 from .report import write, write_report
+from .result import Result, ViewOfFit
+from .torch_bridge import torch_loss, torch_render
+from .watching import Watch
 
 __all__ = [
     "Cluster",
     "Fit",
     "Free",
     "Loss",
+    "LossFunction",
     "Problem",
     "Processes",
+    "Result",
     "Stage",
     "Starts",
+    "Step",
     "Target",
     "ViewOfFit",
+    "Watch",
+    "drjit_loss",
     "fit",
+    "prior",
     "read",
+    "smooth_mesh",
+    "smooth_texture",
+    "torch_loss",
+    "torch_render",
     "write",
     "write_report",
 ]

@@ -12,10 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import replacing
 
 #: Of the file's layout.
-VERSION = 1
+VERSION = 2
+
+#: Of compression: 1 is as good as 6 for numbers of optimisers (7 % of 50 MB), and takes two thirds of the time.
+LEVEL = 1
 
 
 def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
@@ -29,7 +33,10 @@ def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any])
     """
     text = json.dumps({**facts, "version": VERSION})
     with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **{f"array/{name}": array for name, array in arrays.items()}, facts=np.array(text))
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
+            for name, array in {"facts": np.array(text), **{f"array/{k}": a for k, a in arrays.items()}}.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as part:
+                    np.lib.format.write_array(part, np.asanyarray(array), allow_pickle=False)
         file.flush()
         os.fsync(file.fileno())
 
@@ -49,7 +56,7 @@ def load(path: Path, who: str = "fit") -> tuple[dict[str, np.ndarray], dict[str,
     except FileNotFoundError:
         raise FileNotFoundError(f'{who}: there is no checkpoint "{path}" to resume from') from None
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f'{who}: "{path}" is no checkpoint, or damaged: {error}') from None
+        raise InputError(f'{who}: "{path}" is no checkpoint, or damaged: {error}') from None
     if facts.get("version") != VERSION:
-        raise ValueError(f'{who}: "{path}" has the layout {facts.get("version")}, this program writes {VERSION}')
+        raise InputError(f'{who}: "{path}" has the layout {facts.get("version")}, this program writes {VERSION}')
     return arrays, facts

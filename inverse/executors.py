@@ -16,6 +16,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError, Refusal
+
 from . import problem as problems
 from .problem import Problem
 from .renderer import Gradient, Renderer, Task
@@ -44,7 +46,9 @@ def _use_threads(count: int) -> None:
 
 
 def _text(problem: Problem) -> str:
-    return problems.text(problems.relative_to(problem, Path.cwd()))
+    text = problems.text(problems.relative_to(problem, Path.cwd()))
+    problems.check_is_text(text)
+    return text
 
 
 class Processes:
@@ -55,7 +59,7 @@ class Processes:
 
     def __init__(self, problem: Problem, count: int):
         if count < 1:
-            raise ValueError(f"fit: the number of workers must be >= 1, got {count}")
+            raise InputError(f"fit: the number of workers must be >= 1, got {count}")
         self.problem, self.count = _text(problem), count
         self.pool = self._start()
 
@@ -80,9 +84,7 @@ class Processes:
                 log.warning("a worker died (%d of %d tries); its tasks are done again", attempt + 1, TRIES)
                 self.close()
                 self.pool = self._start()
-        raise RuntimeError(
-            f"fit: workers died {TRIES} times in a row; is there enough memory for {self.count} of them?"
-        )
+        raise Refusal(f"fit: workers died {TRIES} times in a row; is there enough memory for {self.count} of them?")
 
     def close(self) -> None:
         self.pool.shutdown(wait=False, cancel_futures=True)
@@ -106,7 +108,7 @@ class Cluster:
         try:
             from dask.distributed import Client
         except ImportError:
-            raise ValueError("fit: a cluster needs the package distributed: pip install 'rimlight[cluster]'") from None
+            raise InputError("fit: a cluster needs the package distributed: pip install 'rimlight[cluster]'") from None
         self.problem = _text(problem)
         try:
             if address == "local":
@@ -114,7 +116,7 @@ class Cluster:
             else:
                 self.client = Client(address, timeout=20)
         except (OSError, ValueError) as error:
-            raise ValueError(f'fit: no cluster at "{address}": {error}') from None
+            raise InputError(f'fit: no cluster at "{address}": {error}') from None
 
     def __call__(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> list[Gradient]:
         # As one datum with a name of its own: Dask would name those of a dictionary by its keys, in each step alike.

@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 from .problem import Free
 
 #: Legal ranges of what a parameter's name says it is; the first that fits counts.
@@ -164,10 +166,10 @@ class Vertices(Parameter):
         chosen = np.tile(_axes(self.free.move), (count, 1))
         if self.free.vertices:
             if max(self.free.vertices) >= count or min(self.free.vertices) < 0:
-                raise ValueError(f'fit: "{self.name}" has vertices 0 … {count - 1}, got {list(self.free.vertices)}')
+                raise InputError(f'fit: "{self.name}" has vertices 0 … {count - 1}, got {list(self.free.vertices)}')
             chosen[np.setdiff1d(np.arange(count), self.free.vertices)] = 0
         if self.free.smoothing and not chosen.all():
-            raise ValueError(f'fit: smoothing moves all vertices of "{self.name}" in all directions')
+            raise InputError(f'fit: smoothing moves all vertices of "{self.name}" in all directions')
         return chosen
 
     def errors(self, latents):
@@ -197,11 +199,11 @@ class Values(Parameter):
         self.truth = {key: truth}
         self.start = {key: np.resize(start, len(truth)).astype(np.float32)}
         if free.unit_length and (truth.size % 3 or not np.linalg.norm(self.start[key].reshape(-1, 3), axis=1).all()):
-            raise ValueError(
+            raise InputError(
                 f'fit: "{key}" has no rows of three numbers, or one of length 0: it cannot have unit_length'
             )
         if not np.array_equal(self.legal(key, self.start[key]), self.start[key]) and not free.unit_length:
-            raise ValueError(
+            raise InputError(
                 f'fit: "{key}" starts outside of its legal range {self.low} … {self.high}; '
                 "set lower and upper if that is meant"
             )
@@ -267,7 +269,7 @@ def _check_free_once(entry: Free, rigid: Iterable[str], found: Iterable[Paramete
         before = [p for p in found if key in p.keys]
         as_both = key in rigid and len(before) == 1 and isinstance(before[0], Vertices)
         if entry.key.count(key) > 1 or (before and not as_both):
-            raise ValueError(
+            raise InputError(
                 f'fit: "{key}" is free twice; vertices may be, with the kind "shape", and then, in a later entry, '
                 'with the kind "pose"'
             )
@@ -276,12 +278,12 @@ def _check_free_once(entry: Free, rigid: Iterable[str], found: Iterable[Paramete
 def _check_key(key: str, params: Any) -> None:
     if key not in params:
         close = difflib.get_close_matches(key, list(params.keys()), n=3, cutoff=0.4)
-        raise ValueError(
+        raise InputError(
             f'fit: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
         )
     value = params[key]
     if not is_transform(value) and not (dr.is_diff_v(value) and dr.is_float_v(value)):
-        raise ValueError(f'fit: "{key}" is of type {type(value).__name__}, which has no derivative')
+        raise InputError(f'fit: "{key}" is of type {type(value).__name__}, which has no derivative')
 
 
 # ------------------------------------------------------------------ values of scenes
@@ -364,8 +366,10 @@ def _body(key: str) -> str:
 
 
 def _numbers(numbers: tuple[float, ...], counts: set[int], name: str, expected: str) -> np.ndarray:
-    if len(numbers) not in counts or not np.isfinite(numbers).all():
-        raise ValueError(f'fit: the start of "{name}" needs {expected}, got {len(numbers)}')
+    if len(numbers) not in counts:
+        raise InputError(f'fit: the start of "{name}" needs {expected}, got {len(numbers)}')
+    if bad := [x for x in numbers if not np.isfinite(x)]:
+        raise InputError(f'fit: the start of "{name}" must be finite, got {bad[0]}')
     return np.array(numbers, np.float64)
 
 
@@ -373,4 +377,4 @@ def _large_steps(positions: mi.Float, faces: mi.UInt, smoothing: float) -> Any:
     try:
         return mi.ad.LargeSteps(positions, faces, smoothing)
     except ImportError as error:
-        raise ValueError("fit: smoothing needs the package cholespy: pip install cholespy") from error
+        raise InputError("fit: smoothing needs the package cholespy: pip install cholespy") from error

@@ -1,13 +1,14 @@
-"""The description of a fit: frozen dataclasses, which TOML files and the command line fill in."""
+"""The description of a fit: frozen dataclasses, which TOML files and the command line fill in, and Python programs with
+scenes, pictures, losses and optimisers in memory besides."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import cattrs
 import tomli_w
@@ -17,6 +18,9 @@ from cattrs.strategies import configure_union_passthrough
 from rimlight.exr import replacing
 from rimlight.loading import InputError
 
+from . import losses
+from .losses import Loss, Norm
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -25,17 +29,32 @@ else:
 Kind = Literal["pose", "material", "light", "shape"]
 Value = str | bool | int | float
 
-#: Classes of ImageNet.
-CLASSES = 1000
+# What files and the command line can say is less than what Python can.
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    Scene: TypeAlias = Path | str | dict[str, Any] | mi.Scene
+    Picture: TypeAlias = Path | str | Any
+    Rate: TypeAlias = float | Callable[[int], float]
+    Rule: TypeAlias = Literal["adam", "sgd"] | Any
+else:
+    Scene, Picture, Rate, Rule = Path, Path, float, Literal["adam", "sgd"]
+
+
+def _place(source: Any) -> Any:
+    """What stands for a path, with texts as paths."""
+    return Path(source) if isinstance(source, str) else source
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
     """A picture that the scene should look like."""
 
-    file: Path | None = None
-    """Picture: EXR, PNG or JPEG. Without one, the unchanged scene file is rendered; its parameters are the truth."""
-    scene: Path | None = None
+    file: Picture | None = None
+    """Picture: EXR, PNG or JPEG. Without one, the unchanged scene file is rendered; its parameters are the truth. In
+    Python also an array or tensor, (H, W, C), of linear radiance if its numbers are floats, else sRGB; or a function of
+    the view, which has a `size`, (H, W), and a `number`, and returns such an array."""
+    scene: Scene | None = None
     """Scene that the picture shows. Default: the scene of the problem."""
     sensor: int = 0
     """Number of the sensor that took the picture."""
@@ -43,12 +62,16 @@ class Target:
     """How its numbers relate to radiance. auto: EXR is linear, PNG and JPEG are sRGB."""
     alpha: bool = False
     """Weigh pixels by the alpha channel of the picture."""
-    mask: Path | None = None
+    mask: Picture | None = None
     """Picture whose black pixels are left out of the loss."""
     resize: bool = False
     """Resample the picture if its size is not that of the film."""
     spp: int = 4096
     """Samples per pixel of a target that is rendered."""
+
+    def __post_init__(self) -> None:
+        for name in ("file", "scene", "mask"):
+            object.__setattr__(self, name, _place(getattr(self, name)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +80,8 @@ class Free:
     rigid body. Other vertex positions move one by one. Of all other parameters, the numbers themselves change."""
 
     key: tuple[str, ...]
-    """Parameters, as `rimlight params` lists them. Several keys move as one rigid body, or are fitted alike."""
+    """Parameters, as `rimlight params` lists them. Several keys move as one rigid body, or are fitted alike. In Python
+    one key may stand without the tuple."""
     kind: Kind
     """Kind of the parameter. `rimlight fit KIND` optimises the parameters of one kind."""
     rate: float = 0.01
@@ -82,27 +106,9 @@ class Free:
     """Where the fit starts. Rigid bodies: a displacement and a rotation vector in degrees, 6 numbers. Vertices: a
     displacement of each, or one for all. Others: the value, or one number for all. Default: the value in the scene."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Loss:
-    """Loss function: how much two pictures differ, as a weighted mean over pixels and channels; or, with `classifier`,
-    what a neural network sees in the picture."""
-
-    norm: Literal["l1", "l2", "relative", "classifier"] = "l2"
-    """l1: |d|, l2: d², relative: d² / (t² + 0.01), of the difference d and the target t. classifier: the logarithm of
-    the probabilities of `fall` over those of `rise`. It compares nothing: the target is the unchanged scene file, shown
-    to people. Needs the extra `adversarial`."""
-    rise: dict[str, int] = dataclasses.field(default_factory=dict)
-    """Classes of ImageNet whose probability shall rise: label -> number, 0 … 999."""
-    fall: dict[str, int] = dataclasses.field(default_factory=dict)
-    """Classes of ImageNet whose probability shall fall: label -> number, 0 … 999."""
-    pyramid: int = 0
-    """Levels of a Gaussian pyramid. The loss is the mean over the levels. 0: only the pictures themselves."""
-    exclude_above: float | None = None
-    """Leave out pixels whose target exceeds this radiance in any channel."""
-    channel: str | None = None
-    """Name of the channel of `aov_edge` that is compared, such as a depth map or a mask. The target holds its numbers
-    as they are. Default: none, for integrators that render nothing but light."""
+    def __post_init__(self) -> None:
+        if isinstance(self.key, str):
+            object.__setattr__(self, "key", (self.key,))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,10 +121,18 @@ class Stage:
     """Width of the film, in pixels. Default: the width in the scene."""
     spp: int = 4
     """Samples per pixel of the image, and of the derivative as well."""
-    rate: float = 1
-    """Factor of all rates at the beginning of the stage."""
+    rate: Rate = 1
+    """Factor of all rates at the beginning of the stage. In Python also a schedule: a function of the number of the
+    step in the stage, which returns the factor."""
     decay: float = 1
     """Rates at the end of the stage over those at its beginning. In between, they change exponentially."""
+    norm: Norm | None = None
+    """Norm of the loss in this stage. Default: that of the loss of the problem."""
+
+    def factor(self, iteration: int) -> float:
+        """Factor of all rates in a step of the stage."""
+        first = self.rate(iteration) if callable(self.rate) else self.rate
+        return float(first * self.decay ** (iteration / max(self.iterations - 1, 1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,17 +151,19 @@ class Starts:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """The complete description of a fit. It is written to TOML and read from it without loss."""
+    """The complete description of a fit. It is written to TOML and read from it without loss, unless parts of it are
+    objects in memory. `target` may hold pictures as they are: then number i was taken by sensor i."""
 
-    scene: Path
-    """Scene file of Mitsuba 3."""
+    scene: Scene
+    """Scene file of Mitsuba 3. In Python also a dictionary, as for `mi.load_dict`, or an `mi.Scene`, which the fit
+    changes."""
     define: dict[str, str] = dataclasses.field(default_factory=dict)
     """Values for parameters of the scene file, such as res."""
     target: tuple[Target, ...] = (Target(),)
     """Pictures that the scene should look like."""
     free: tuple[Free, ...]
     """Free parameters, which the fit optimises."""
-    loss: Loss = Loss()
+    loss: Loss = dataclasses.field(default_factory=Loss)
     """Loss function."""
     stage: tuple[Stage, ...] = (Stage(),)
     """Stages, one after the other."""
@@ -155,8 +171,9 @@ class Problem:
     """Several starting points."""
     integrator: dict[str, Value] = dataclasses.field(default_factory=lambda: {"type": "prb_edge"})
     """Integrator plugin that renders and differentiates, with its parameters."""
-    optimiser: Literal["adam", "sgd"] = "adam"
-    """Optimiser of Mitsuba. With sgd, `rate` is a factor of the gradient, not a length."""
+    optimiser: Rule = "adam"
+    """Optimiser of Mitsuba. With sgd, `rate` is a factor of the gradient, not a length. In Python also any other one:
+    see `Optimiser`."""
     momentum: float = 0.9
     """Momentum of sgd, and first decay rate of adam."""
     smooth_scale: float = 0.99
@@ -183,7 +200,26 @@ class Problem:
     Default: one for each core."""
 
     def __post_init__(self) -> None:
+        put = lambda name, value: object.__setattr__(self, name, value)
+        put("scene", _place(self.scene))
+        if callable(self.loss) and not isinstance(self.loss, Loss):
+            put("loss", Loss(norm=self.loss))
+        for name in ("free", "stage", "target"):
+            entries = getattr(self, name)
+            put(name, tuple(entries) if isinstance(entries, tuple | list) else (entries,))
+        targets = (t if isinstance(t, Target) else Target(file=t, sensor=i) for i, t in enumerate(self.target))
+        put("target", tuple(targets))
         check(self)
+
+    @property
+    def norms(self) -> tuple[Norm, ...]:
+        """Of the loss in each stage."""
+        return tuple(self.loss.norm if stage.norm is None else stage.norm for stage in self.stage)
+
+    @property
+    def compares(self) -> bool:
+        """Are pictures compared with their targets?"""
+        return all(map(losses.compares, self.norms))
 
 
 # ------------------------------------------------------------------ checks
@@ -216,10 +252,11 @@ def check(problem: Problem) -> None:
         )
     for i, stage in enumerate(problem.stage):
         _at_least(f"stage.{i}.", stage, {"iterations": 1, "resolution": 1, "spp": 1})
-        _positive(f"stage.{i}.", stage, ("rate", "decay"))
+        _positive(f"stage.{i}.", stage, ("decay",) if callable(stage.rate) else ("rate", "decay"))
     for i, target in enumerate(problem.target):
         _at_least(f"target.{i}.", target, {"sensor": 0, "spp": 1})
-    _check_classifier(problem)
+    pictures = ((f"target.{i}.{n}", getattr(t, n)) for i, t in enumerate(problem.target) for n in ("file", "mask"))
+    losses.check(problem.loss, problem.norms, [name for name, picture in pictures if picture is not None])
     for i, free in enumerate(problem.free):
         where = f"free.{i}."
         if not free.key:
@@ -238,32 +275,7 @@ def check(problem: Problem) -> None:
             raise InputError(f"fit: {where}lower must be below upper, got {low} and {high}")
 
 
-def _check_classifier(problem: Problem) -> None:
-    loss = problem.loss
-    named = [*loss.rise.items(), *loss.fall.items()]
-    if loss.norm != "classifier":
-        if named:
-            raise InputError(f'fit: loss.rise and loss.fall need the norm "classifier", got "{loss.norm}"')
-        return
-    if not named:
-        raise InputError('fit: the norm "classifier" needs loss.rise or loss.fall, such as { "traffic light" = 920 }')
-    for label, number in named:
-        if not 0 <= number < CLASSES:
-            raise InputError(f'fit: the class "{label}" must have a number 0 … {CLASSES - 1}, got {number}')
-    for what, column in (("label", 0), ("class", 1)):
-        given = [pair[column] for pair in named]
-        if twice := {x for x in given if given.count(x) > 1}:
-            raise InputError(f'fit: loss.rise and loss.fall name the {what} "{twice.pop()}" twice')
-    for name in ("pyramid", "exclude_above"):
-        if getattr(loss, name):
-            raise InputError(f'fit: loss.{name} needs pictures that are compared, the norm "classifier" has none')
-    for i, target in enumerate(problem.target):
-        for name in ("file", "mask"):
-            if getattr(target, name) is not None:
-                raise InputError(f'fit: target.{i}.{name}: with the norm "classifier" there is nothing to compare with')
-
-
-def _at_least(where: str, of: Any, minima: Mapping[str, float]) -> None:
+def _at_least(where: str, of: Any, minima: dict[str, float]) -> None:
     for name, minimum in minima.items():
         value = getattr(of, name)
         if value is not None and not value >= minimum:
@@ -279,6 +291,12 @@ def _positive(where: str, of: Any, names: tuple[str, ...]) -> None:
 
 # ------------------------------------------------------------------ files
 
+
+#: Begins the name of an object that a file cannot hold.
+IN_MEMORY = "in memory: "
+
+#: Names of objects that are no longer than so are what they say of themselves; characters.
+LONGEST_NAME = 500
 
 #: Type of a field -> its name for people, and what a file may say.
 EXACT: dict[type, tuple[str, tuple[type, ...]]] = {
@@ -308,7 +326,7 @@ def _exactly(told: str, allowed: tuple[type, ...]) -> Any:
 
     def structure(value: Any, kind: type) -> Any:
         if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
-            raise ValueError(f"fit: expected {told}, got {value!r}")
+            raise InputError(f"fit: expected {told}, got {value!r}")
         return kind(value)
 
     return structure
@@ -327,20 +345,21 @@ def read(path: Path | str) -> Problem:
     try:
         problem = from_text(path.read_text("utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise InputError(f"{path}: {error}") from None
     return relative_to(problem, path.parent)
 
 
 def from_text(text: str) -> Problem:
     """Read a problem from TOML. Raises ValueError, as `read` does."""
+    check_is_text(text)
     tables = parse(text)
     for name in ("target", "free", "stage"):
         if isinstance(tables.get(name), dict):
-            raise ValueError(f"fit: there may be several of {name}, write [[{name}]] instead of [{name}]")
+            raise InputError(f"fit: there may be several of {name}, write [[{name}]] instead of [{name}]")
     try:
         return _converter().structure(tables, Problem)
     except cattrs.BaseValidationError as error:
-        raise ValueError("; ".join(cattrs.transform_error(error, "fit", _say))) from None
+        raise InputError("; ".join(cattrs.transform_error(error, "fit", _say))) from None
 
 
 def _say(error: BaseException, kind: type | None) -> str:
@@ -348,7 +367,7 @@ def _say(error: BaseException, kind: type | None) -> str:
 
 
 def write(path: Path, problem: Problem) -> None:
-    """Write a problem as `read` reads it, with absolute paths."""
+    """Write a problem as `read` reads it, with absolute paths. What is in memory only is named, but cannot be read."""
     with replacing(path) as temporary:
         temporary.write_text(text(relative_to(problem, Path.cwd())), "utf-8")
 
@@ -360,19 +379,55 @@ def parse(text: str) -> dict[str, Any]:
 
 def text(problem: Problem) -> str:
     """A problem as TOML."""
-    return tomli_w.dumps(_without_none(_converter().unstructure(problem)))
+    return tomli_w.dumps(tables(problem))
+
+
+def tables(problem: Problem) -> dict[str, Any]:
+    """A problem as a dictionary for TOML."""
+    # First of all, paths in place of arrays, which cannot be compared with defaults.
+    said = _with_sources(
+        problem, lambda source: source if isinstance(source, Path) else Path(IN_MEMORY + _kind(source))
+    )
+    return _plain(_converter().unstructure(said))
 
 
 def relative_to(problem: Problem, folder: Path) -> Problem:
     """The problem with all paths seen from a folder, absolute."""
-    place = lambda path: None if path is None else (folder / path).resolve()
-    targets = tuple(
-        dataclasses.replace(t, file=place(t.file), scene=place(t.scene), mask=place(t.mask)) for t in problem.target
-    )
-    return dataclasses.replace(problem, scene=(folder / problem.scene).resolve(), target=targets)
+    return _with_sources(problem, lambda source: (folder / source).resolve() if isinstance(source, Path) else source)
 
 
-def _without_none(value: Any) -> Any:
+def _with_sources(problem: Problem, change: Callable[[Any], Any]) -> Problem:
+    """The problem with other scenes and pictures. change : makes them of those that there are."""
+    of = lambda source: None if source is None else change(source)
+    targets = tuple(dataclasses.replace(t, file=of(t.file), scene=of(t.scene), mask=of(t.mask)) for t in problem.target)
+    return dataclasses.replace(problem, scene=of(problem.scene), target=targets)
+
+
+def _plain(value: Any) -> Any:
+    """Tables without what is None, and with the names of objects that TOML cannot hold."""
     if isinstance(value, dict):
-        return {k: _without_none(v) for k, v in value.items() if v is not None}
-    return [_without_none(v) for v in value] if isinstance(value, list | tuple) else value
+        return {k: _plain(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value if isinstance(value, str | bool | int | float) else IN_MEMORY + _name(value)
+
+
+def _name(thing: Any) -> str:
+    """Of an object, the same in every process: what it says of itself, unless it says where in memory it is."""
+    said = repr(thing)
+    if " at 0x" not in said and len(said) < LONGEST_NAME:
+        return said
+    return f"{thing.__module__}.{thing.__qualname__}" if hasattr(thing, "__qualname__") else _kind(thing)
+
+
+def _kind(thing: Any) -> str:
+    return f"{type(thing).__module__}.{type(thing).__qualname__}"
+
+
+def check_is_text(text: str) -> None:
+    """Refuse a problem of which a part is an object in memory. InputError: there is one."""
+    if IN_MEMORY in text:
+        raise InputError(
+            "fit: a scene, picture, loss, schedule or optimiser of this fit is an object in the memory of a Python "
+            "program, which files and other processes cannot hold; name a file, or a loss and an optimiser by name"
+        )

@@ -1,14 +1,15 @@
 """Loss and gradient of one view of a problem, as a pure function of NumPy arrays: what processes and machines share.
 
-The picture is rendered, compared with the target (or shown to a classifier) on the host, and the derivative of the loss
-with respect to its pixels weighs a second, independent render, backward. Both are recorded once and replayed
-(`dr.freeze`) where that is possible.
+The picture is rendered, compared with the target on the host, and the derivative of the loss with respect to its pixels
+weighs a second, independent render, backward. Both are recorded once and replayed (`dr.freeze`) where that is possible.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,9 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight import no_collection
-from rimlight.loading import load_integrator, load_scene, use_variant
+from rimlight.loading import InputError, load_integrator, use_variant
 
-from . import classifier, losses, targets
+from . import losses, sources, targets
 from .free_parameters import from_flat, to_numpy
 from .problem import Problem
 
@@ -33,24 +34,44 @@ REPLAYED = ("prb", "prb_basic", "path", "direct")
 MAX_SAMPLES = 2**22
 
 
+#: Held by whoever renders: two threads that record kernels at once abort Dr.Jit 1.5.
+_rendering = threading.RLock()
+_last = threading.get_ident()
+
+
+@contextmanager
+def alone(variant: str) -> Iterator[None]:
+    """Within it, no other thread renders or differentiates for a fit. variant : of Mitsuba, which each thread sets."""
+    global _last
+    with _rendering:
+        if mi.variant() != variant:
+            use_variant(variant)
+        if _last != threading.get_ident():
+            # What this thread records may depend on what another one did since its last turn.
+            dr.detail.new_scope(dr.backend_v(mi.Float))
+            _last = threading.get_ident()
+        yield
+
+
 @dataclass(frozen=True)
 class Task:
     """One picture to compare, and its gradient.
 
     target : number of the target. width : of the film, pixels; None: as the scene has it. spp : samples per pixel.
-    seed : of the image; that of the derivative differs from it.
+    seed : of the image; that of the derivative differs from it. stage : number of the one whose loss it is.
     """
 
     target: int
     width: int | None
     spp: int
     seed: int
+    stage: int = 0
 
 
 @dataclass(frozen=True)
 class Gradient:
     """loss : at a render. gradients : key -> as `to_numpy` has the value. image : (H, W, C), what was rendered.
-    scores : label -> probability, with the norm "classifier"."""
+    scores : the metrics of the loss, label -> number."""
 
     loss: float
     gradients: dict[str, np.ndarray]
@@ -62,29 +83,29 @@ class Renderer:
     """The scenes and targets of a problem, loaded.
 
     params : of all scenes, key -> value; where several scenes have a key, that of the first.
+    losses : of each stage.
+    scenes : the loaded ones, by `sources.key`.
 
     Raises
     ------
-    ValueError, OSError : scene, integrator or target cannot be loaded, or do not fit together. The text is one line.
+    InputError, OSError : scene, integrator or target cannot be loaded, or do not fit together. The text is one line.
     """
 
     def __init__(self, problem: Problem):
         use_variant(problem.variant)
         self.problem = problem
-        if problem.loss.norm == "classifier":
-            classifier.network()  # if it is missing, say so before anything is rendered
+        self.losses = [losses.function(problem.loss, norm) for norm in problem.norms]
         options = dict(problem.integrator)
         kind = options.pop("type")
-        define = [f"{key}={value}" for key, value in problem.define.items()]
-        paths = [target.scene or problem.scene for target in problem.target]
+        used = [problem.scene if target.scene is None else target.scene for target in problem.target]
         gc.collect()  # as long as a scene that nobody needs exists, its materials are in all kernels that are compiled
         # Every load of a scene costs memory that never comes back.
-        scenes = {path: load_scene(path, define) for path in dict.fromkeys(paths)}
+        self.scenes = {key: sources.scene(s, problem.define) for key, s in {sources.key(s): s for s in used}.items()}
         # One for each: ours remember the edges of the last scene.
-        integrators = {path: load_integrator(kind, **options) for path in scenes}
-        self.views = [View(self, i, scenes[path], integrators[path]) for i, path in enumerate(paths)]
+        integrators = {key: load_integrator(kind, **options) for key in self.scenes}
+        self.views = [View(self, i, self.scenes[k], integrators[k]) for i, k in enumerate(map(sources.key, used))]
         self.params = {}
-        for scene in scenes.values():
+        for scene in self.scenes.values():
             self.params = dict(mi.traverse(scene).items()) | self.params
 
     def image(self, values: Mapping[str, np.ndarray], task: Task) -> np.ndarray:
@@ -101,12 +122,25 @@ class Renderer:
         view = self.views[task.target]
         leaves = view.set(values, task.width)
         image = view.render(task.seed, task.spp)
-        loss, by_pixel, scores = view.compared(image)
-        view.backward(by_pixel, derived_seed(task.seed), task.spp)
+        loss, by_pixel, scores = view.compared(image, task.stage)
+        return Gradient(loss, self._collected(view, leaves, by_pixel, derived_seed(task.seed), task.spp), image, scores)
+
+    def gradient_of(self, values: Mapping[str, np.ndarray], by_pixel: np.ndarray, task: Task) -> dict[str, np.ndarray]:
+        """The derivative of anything of which that with respect to each number of the picture is known.
+
+        by_pixel : (H, W, C), this one. task : its seed is that of the derivative image.
+        """
+        view = self.views[task.target]
+        return self._collected(view, view.set(values, task.width), by_pixel, task.seed, task.spp)
+
+    @staticmethod
+    def _collected(
+        view: View, leaves: Mapping[str, mi.Float], by_pixel: np.ndarray, seed: int, spp: int
+    ) -> dict[str, np.ndarray]:
+        view.backward(by_pixel, seed, spp)
         found = {key: dr.grad(leaf) for key, leaf in leaves.items()}
         dr.eval(found)
-        gradients = {key: np.array(gradient, np.float32) for key, gradient in found.items()}
-        return Gradient(loss, gradients, image, scores)
+        return {key: np.array(gradient, np.float32) for key, gradient in found.items()}
 
     def derivative(self, values: Mapping[str, np.ndarray], change: Mapping[str, np.ndarray], task: Task) -> np.ndarray:
         """Derivative of a picture as the values change, forward: (H, W, C), float32.
@@ -127,7 +161,7 @@ class View:
         self.params = mi.traverse(scene)
         self.initial = dict(self.params.items())
         if self.target.sensor >= len(scene.sensors()):
-            raise ValueError(
+            raise InputError(
                 f"fit: target.{number}.sensor: the scene has {len(scene.sensors())} sensors, there is no number "
                 f"{self.target.sensor}"
             )
@@ -141,7 +175,7 @@ class View:
         film = self.sensor.film()
         self.size = tuple(int(n) for n in reversed(film.crop_size()))
         if tuple(film.crop_size()) != tuple(film.size()) and any(s.resolution for s in renderer.problem.stage):
-            raise ValueError(
+            raise InputError(
                 f"fit: target.{number}: the film is cropped, so that its resolution cannot change; leave out "
                 "resolution in the stages, or the crop in the scene"
             )
@@ -155,20 +189,20 @@ class View:
 
         Raises
         ------
-        ValueError : the integrator has no such channel, or several of which none is named.
+        InputError : the integrator has no such channel, or several of which none is named.
         """
         channel, integrator = self.renderer.problem.loss.channel, self.integrator
         if not hasattr(integrator, "layout"):
             if channel is None:
                 return True
-            raise ValueError(
+            raise InputError(
                 f'fit: loss.channel is "{channel}", but the integrator renders light alone; use aov_edge, such as '
                 f'integrator = {{ type = "aov_edge", aovs = "{channel}:depth" }}'
             )
         known = [*integrator.nested, *(c.name for c in integrator.channels)]
         if channel not in known:
             got = "is missing" if channel is None else f'cannot be "{channel}"'
-            raise ValueError(f"fit: loss.channel {got}: the integrator has {', '.join(known)}")
+            raise InputError(f"fit: loss.channel {got}: the integrator has {', '.join(known)}")
         return channel in integrator.nested
 
     # ---------------------- Target ----------------------
@@ -180,14 +214,12 @@ class View:
             if self.target.file is None:
                 self._resize(None)
                 image = self._truth()
-                if loss.norm == "classifier" and image.shape[2] != 3:
-                    raise ValueError(
-                        f"fit: target.{self.number}: the classifier wants 3 channels, the film has {image.shape[2]}"
-                    )
                 weight = np.ones(image.shape[:2], np.float32)
             else:
                 plain = not self.shows_light and self.target.colour == "auto"
                 target = replace(self.target, colour="linear") if plain else self.target
+                if callable(target.file):
+                    target = replace(target, file=target.file(self))
                 image, weight = targets.read(target, self.size)
             self._picture = image, losses.pixels_that_count(loss, image, weight)
         return self._picture
@@ -205,23 +237,43 @@ class View:
     def target_at(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         image, weight = targets.smaller(*self.picture(), size)
         if not weight.any():
-            raise ValueError(
+            raise InputError(
                 f"fit: target.{self.number}: no pixel counts at {size[1]} x {size[0]}, each holds something that mask, "
                 "alpha or exclude_above leave out; use a larger resolution"
             )
         return image, weight
 
-    def compared(self, image: np.ndarray) -> tuple[float, np.ndarray, dict[str, float]]:
-        """Loss of a picture, its derivative with respect to each number of it, and the scores of a classifier."""
-        loss = self.renderer.problem.loss
-        if loss.norm == "classifier":
-            return classifier.value_and_gradient(loss, image)
+    def compared(self, image: np.ndarray, stage: int) -> tuple[float, np.ndarray, dict[str, float]]:
+        """Loss of a picture, in a stage, its derivative with respect to each number of it, and metrics."""
         target, weight = self.target_at(image.shape[:2])
         if target.shape[2] not in (1, image.shape[2]):
-            raise ValueError(
+            raise InputError(
                 f"fit: target.{self.number}: the picture has {target.shape[2]} channels, the film {image.shape[2]}"
             )
-        return *losses.value_and_gradient(loss, image, target, weight), {}
+        return self.renderer.losses[stage](image, target, weight)
+
+    def check(self, stage: int) -> None:
+        """Say at once what is wrong with the target, or with the loss of a stage.
+
+        Raises
+        ------
+        InputError, OSError : it is.
+        """
+        size = self.size_at(self.renderer.problem.stage[stage].resolution)
+        target, weight = self.target_at(size)
+        loss = self.renderer.losses[stage]
+        who = f'fit: target.{self.number}: the loss "{losses.label(loss)}"'
+        try:
+            found = loss(target, target, weight)
+        except InputError as error:
+            raise InputError(f"fit: target.{self.number}: {error}") from None
+        try:
+            value, gradient, metrics = found
+            value, shape, metrics = float(value), np.shape(gradient), dict(metrics)
+        except (TypeError, ValueError):
+            raise InputError(f"{who} must return a number, its gradient, and a dictionary of metrics") from None
+        if shape != target.shape:
+            raise InputError(f"{who} has a gradient of shape {shape} for a picture of shape {target.shape}")
 
     # ---------------------- Scene ----------------------
 
@@ -255,6 +307,10 @@ class View:
             leaves[key] = leaf
         self.params.update()
         return leaves
+
+    def count(self, key: str) -> int:
+        """How many numbers a parameter has."""
+        return to_numpy(self.initial[key]).size
 
     def size_at(self, width: int | None) -> tuple[int, int]:
         """Height and width of the film."""

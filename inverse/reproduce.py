@@ -21,14 +21,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rimlight import scenes
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import replacing
 from rimlight.loading import one_line
 from rimlight.scenes import room, traffic_sign
 
 from . import classifier, report
 from . import problem as problems
-from .fitting import Fit, fit
+from .fitting import fit
 from .problem import Problem
+from .result import Result, finite
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +65,7 @@ class Outcome:
 
     left : largest error of a parameter over that at the start; pose : of rigid bodies alone. values : median over
         objects of the largest relative error of their materials and lights. picture, noise : root mean square errors
-        of the first view, at the result and at the truth. status : see `Fit`; "cannot: …" if the integrator raised.
+        of the first view, at the result and at the truth. status : see `Result`; "cannot: …" if the integrator raised.
     times, losses : of each step. rise, fall : probabilities, at the result, of the classes that a classifier shall see
         and not see, the least and the greatest; then there is no truth, and what is measured by it is 0.
     """
@@ -116,7 +118,7 @@ def reproduce(
     """
     names = FIGURES.get(figure, (figure,))
     if not set(names) <= set(EXPERIMENTS):
-        raise ValueError(f'there is no experiment "{figure}", choose one of {", ".join([*EXPERIMENTS, *FIGURES])}')
+        raise InputError(f'there is no experiment "{figure}", choose one of {", ".join([*EXPERIMENTS, *FIGURES])}')
     if "fig10" in names:
         try:
             classifier.network()
@@ -141,7 +143,8 @@ def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None
     folder = out / name / f"{method}_{seed}"
     file = folder / "outcome.json"
     if file.exists():
-        return Outcome(**json.loads(file.read_text("utf-8")))
+        said = json.loads(file.read_text("utf-8"))
+        return Outcome(**{name: float("nan") if value is None else value for name, value in said.items()})
     problem = dataclasses.replace(problem_of(name, out / name), seed=seed)
     if method == PEER:
         depth = problem.integrator.get("max_depth", 2 if problem.integrator["type"] == "direct_edge" else -1)
@@ -160,7 +163,7 @@ def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None
         outcome = _judge(name, seed, method, found)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(file) as temporary:
-        temporary.write_text(json.dumps(dataclasses.asdict(outcome)), "utf-8")
+        temporary.write_text(json.dumps(finite(dataclasses.asdict(outcome)), allow_nan=False), "utf-8")
     del found
     gc.collect()
     dr.flush_malloc_cache()
@@ -175,7 +178,7 @@ def _cannot(name: str, seed: int, error: Exception) -> Outcome:
     return Outcome(name, seed, PEER, 1.0, 1.0, unknown, unknown, unknown, 0.0, f"cannot: {reason}", [], [])
 
 
-def _judge(name: str, seed: int, method: str, found: Fit) -> Outcome:
+def _judge(name: str, seed: int, method: str, found: Result) -> Outcome:
     left = {label: float(e[-1] / e[0]) for label, e in found.errors.items() if e[0] > 0}
     relative: dict[str, float] = {}  # the largest of each object
     for label, e in found.errors.items():
@@ -209,7 +212,7 @@ def _judge(name: str, seed: int, method: str, found: Fit) -> Outcome:
 def write_summary(out: Path, outcomes: Sequence[Outcome]) -> None:
     """`summary.json`, `summary.md`, and `convergence.png`: losses over time."""
     with replacing(out / "summary.json") as temporary:
-        temporary.write_text(json.dumps([dataclasses.asdict(o) for o in outcomes]), "utf-8")
+        temporary.write_text(json.dumps(finite(list(map(dataclasses.asdict, outcomes))), allow_nan=False), "utf-8")
     with replacing(out / "summary.md") as temporary:
         temporary.write_text("\n".join(table(outcomes)) + "\n", "utf-8")
     write_convergence(out / "convergence.png", outcomes)

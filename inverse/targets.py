@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from skimage.transform import resize
 
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import read_exr
 from rimlight.loading import one_line
 
 from .problem import Target
+from .sources import numbers
+
+#: A target whose mean is so many times that of the scene, or so many times less, is in other units.
+OTHER_UNITS = 1e3
+
+#: What a few pixels hold of the sum of squares, if the others do not matter.
+NEARLY_ALL = 0.999
+
+#: Which part of the pixels are a few; at least one.
+FEW = 1e-3
+
+#: What values below 0 may hold of the sum of absolute values: filters with negative lobes make some.
+SLIGHTLY_NEGATIVE = 0.01
 
 
 def read(target: Target, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -30,52 +45,61 @@ def read(target: Target, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
         its `colour`, or has no alpha channel though `alpha` is on.
     OSError : a file cannot be read.
     """
-    assert target.file is not None
     image, encoded = read_picture(target.file)
     colour = ("srgb" if encoded else "linear") if target.colour == "auto" else target.colour
-    who = f'fit: target "{target.file.name}"'
+    who = f'fit: target "{_name(target.file)}"'
     largest = np.max(image, where=np.isfinite(image), initial=0)
     if colour == "srgb" and not encoded and largest > 1:
-        raise ValueError(f'{who} has values up to {largest:.3g}: it cannot be sRGB, set its colour to "linear"')
-    if colour == "linear" and target.file.suffix.lower() in (".jpg", ".jpeg"):
-        raise ValueError(f'{who}: JPEG files are never linear, set its colour to "srgb"')
+        raise InputError(f'{who} has values up to {largest:.3g}: it cannot be sRGB, set its colour to "linear"')
+    if colour == "linear" and Path(_name(target.file)).suffix.lower() in (".jpg", ".jpeg"):
+        raise InputError(f'{who}: JPEG files are never linear, set its colour to "srgb"')
     weight = np.ones(image.shape[:2], np.float32)
     if image.shape[2] in (2, 4):
         if target.alpha:
             weight = np.clip(np.nan_to_num(image[:, :, -1]), 0, 1)
         image = image[:, :, :-1]
     elif target.alpha:
-        raise ValueError(f"{who} has no alpha channel")
+        raise InputError(f"{who} has no alpha channel")
     if target.mask is not None:
         mask, _ = read_picture(target.mask)
         if mask.shape[:2] != image.shape[:2]:
             if not target.resize:
-                raise ValueError(
-                    f'fit: mask "{target.mask.name}" has {mask.shape[1]} x {mask.shape[0]} pixels, '
+                raise InputError(
+                    f'fit: mask "{_name(target.mask)}" has {mask.shape[1]} x {mask.shape[0]} pixels, '
                     f"the picture {image.shape[1]} x {image.shape[0]}"
                 )
             mask = resample(mask, image.shape[:2])
         weight = weight * np.clip(mask[:, :, 0], 0, 1)
     bad = (weight > 0) & ~np.isfinite(image).all(axis=2)
     if bad.any():
-        raise ValueError(f"{who} has {bad.sum()} pixels that are not finite; repair it, or exclude them by a mask")
+        raise InputError(f"{who} has {bad.sum()} pixels that are not finite; repair it, or exclude them by a mask")
     image = np.where(weight[..., None] > 0, image, np.float32(0))
     if colour == "srgb":
         image = srgb_to_linear(image)
     if image.shape[:2] != size:
         if not target.resize:
-            raise ValueError(
+            raise InputError(
                 f"{who} has {image.shape[1]} x {image.shape[0]} pixels, the film {size[1]} x {size[0]}; "
                 "set resize to resample it"
             )
         image, weight = smaller(image, weight, size)
     if not weight.any():
-        raise ValueError(f"{who}: no pixel counts, mask and alpha are 0 everywhere")
+        raise InputError(f"{who}: no pixel counts, mask and alpha are 0 everywhere")
     return image.astype(np.float32), weight.astype(np.float32)
 
 
-def read_picture(path: Path) -> tuple[np.ndarray, bool]:
-    """Numbers of a picture: (H, W, C), float32, and whether it is of a format that encodes them, in [0, 1]."""
+def _name(source: Any) -> str:
+    return source.name if isinstance(source, Path) else "in memory"
+
+
+def read_picture(source: Any) -> tuple[np.ndarray, bool]:
+    """Numbers of a picture: (H, W, C), float32, and whether it is of a format that encodes them, in [0, 1].
+
+    source : path of a file, array or tensor.
+    """
+    if not isinstance(source, Path):
+        return _decoded(numbers(source), "in memory")
+    path = source
     if not path.is_file():
         raise FileNotFoundError(f'fit: there is no file "{path}"')
     if path.suffix.lower() == ".exr":
@@ -88,10 +112,19 @@ def read_picture(path: Path) -> tuple[np.ndarray, bool]:
         image = np.asarray(mi.Bitmap(str(path)) if path.suffix.lower() == ".png" else io.imread(path))
     except (OSError, ValueError, SyntaxError, RuntimeError) as error:
         raise OSError(f'fit: cannot read "{path}": {one_line(error)}') from None
+    if not np.issubdtype(image.dtype, np.unsignedinteger):
+        raise InputError(f'fit: "{path.name}" is no picture of 8 or 16 bits a channel')
+    return _decoded(image, path.name)
+
+
+def _decoded(image: np.ndarray, name: str) -> tuple[np.ndarray, bool]:
+    """Whole numbers, of a picture of 8 or 16 bits, as parts of the largest one; others as they are."""
     if image.ndim == 2:
         image = image[:, :, None]
-    if image.ndim != 3 or not np.issubdtype(image.dtype, np.unsignedinteger):
-        raise ValueError(f'fit: "{path.name}" is no picture of 8 or 16 bits a channel')
+    if image.ndim != 3 or image.shape[2] > 4:
+        raise InputError(f'fit: "{name}" is no picture of 1 to 4 channels, its shape is {image.shape}')
+    if not np.issubdtype(image.dtype, np.unsignedinteger):
+        return image.astype(np.float32), False
     return (image / np.iinfo(image.dtype).max).astype(np.float32), True
 
 
@@ -100,6 +133,38 @@ def srgb_to_linear(image: np.ndarray) -> np.ndarray:
     import colour
 
     return np.asarray(colour.cctf_decoding(image, function="sRGB"), np.float32)
+
+
+def doubts(image: np.ndarray, target: np.ndarray, weight: np.ndarray) -> list[str]:
+    """Why it may make no sense to compare a render with a target: sentences without their subject, the target.
+
+    image : (H, W, C), the scene at the start, linear radiance. target : (H, W, C or 1). weight : (H, W).
+    """
+    found = []
+    weight = weight[..., None].astype(np.float64)
+    size = np.abs(target.astype(np.float64)) * weight
+    shown, wanted = (float(np.mean(np.abs(a) * weight)) for a in (image.astype(np.float64), target))
+    if not shown / OTHER_UNITS <= wanted <= shown * OTHER_UNITS and wanted > 0:
+        found.append(
+            f"has a mean of {wanted / weight.mean():.3g}, the scene shows {shown / weight.mean():.3g} at the start: "
+            "if it is in other units, scale it"
+        )
+    squares = np.sort(np.square(size).sum(2), axis=None)[::-1]
+    few = max(int(FEW * squares.size), 1)
+    if squares.size > few and squares[:few].sum() > NEARLY_ALL * squares.sum() > 0 and squares[few] > 0:
+        found.append(
+            f"has {few} of {squares.size} pixels, up to {size.max():.3g}, that outweigh all others in a sum of "
+            "squares: leave them out by loss.exclude_above or by a mask"
+        )
+    negative = np.where(target < 0, size, 0).sum()
+    if negative > SLIGHTLY_NEGATIVE * size.sum():
+        found.append(f"has {(target < 0).sum()} values below 0, down to {target.min():.3g}: no radiance is negative")
+    if target.shape[2] == 1 < image.shape[2]:
+        found.append(
+            f"is grey, the film has {image.shape[2]} channels: each is compared with the same numbers, which draws all "
+            'colours to grey; for a scene without colours, give the film the pixel_format "luminance"'
+        )
+    return found
 
 
 def smaller(image: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.refusals import InputError
+
 
 @dataclass(frozen=True)
 class PlannedTerm:
@@ -100,7 +102,7 @@ def plan(
     keys, known = list(params), mi.traverse(scene)
     unknown = [k for k in keys if k not in known]
     if unknown:
-        raise ValueError(f"plan: unknown parameter {', '.join(unknown)}")
+        raise InputError(f"plan: unknown parameter {', '.join(unknown)}")
     before = {k: known[k] for k in keys}
     try:
         for k in keys:

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 CHANNELS = {1: "Y", 3: "RGB", 4: "RGBA"}
 
 #: Attributes that the format itself defines.
@@ -79,19 +81,19 @@ def write_exr(
     for name, layer in layers.items():
         pixels = np.asarray(layer, np.float32)
         if pixels.ndim != 3 or pixels.shape[2] not in CHANNELS or 0 in pixels.shape:
-            raise ValueError(f'{path}: layer "{name}" must be of shape (H, W, 1 | 3 | 4), got {pixels.shape}')
+            raise InputError(f'{path}: layer "{name}" must be of shape (H, W, 1 | 3 | 4), got {pixels.shape}')
         sizes[name] = pixels.shape[:2]
         for i, letter in enumerate(CHANNELS[pixels.shape[2]]):
             channel = f"{name}.{letter}" if name else letter
             channels[channel] = OpenEXR.Channel(channel, np.ascontiguousarray(pixels[:, :, i]))
     if not channels:
-        raise ValueError(f"{path}: there is no layer to write")
+        raise InputError(f"{path}: there is no layer to write")
     if len(set(sizes.values())) > 1:
-        raise ValueError(f"{path}: the layers differ in size: {sizes}")
+        raise InputError(f"{path}: the layers differ in size: {sizes}")
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for key, value in (metadata or {}).items():
         if key in RESERVED or not key:
-            raise ValueError(f'{path}: "{key}" cannot be the name of an attribute: the format needs it for itself')
+            raise InputError(f'{path}: "{key}" cannot be the name of an attribute: the format needs it for itself')
         header[key] = str(value)
 
     with replacing(path) as temporary:
@@ -120,10 +122,10 @@ def write_layers(
     """
     image = np.asarray(image, np.float32)
     if len(set(names)) < len(names) or not all(names):
-        raise ValueError(f"{path}: the layers need names that differ, got {list(names)}")
+        raise InputError(f"{path}: the layers need names that differ, got {list(names)}")
     channels = image.shape[2] // max(len(names), 1) if image.ndim == 3 else 0
     if channels not in (1, 3) or channels * len(names) != image.shape[2]:
-        raise ValueError(f"{path}: an image of shape {image.shape} does not consist of {len(names)} layers")
+        raise InputError(f"{path}: an image of shape {image.shape} does not consist of {len(names)} layers")
     layers = {name: image[:, :, i * channels : (i + 1) * channels] for i, name in enumerate(names)}
     write_exr(path, layers, {"layers": json.dumps(list(names)), **(metadata or {})})
 
@@ -143,7 +145,7 @@ def read_layers(path: str | Path) -> tuple[np.ndarray, list[str]]:
     """
     layers, metadata = read_exr(path)
     if "layers" not in metadata:
-        raise ValueError(f"{path}: the order of the layers is not stored in it")
+        raise InputError(f"{path}: the order of the layers is not stored in it")
     names = json.loads(metadata["layers"])
     return np.concatenate([layers[name] for name in names], axis=2), names
 

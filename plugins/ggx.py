@@ -21,6 +21,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 #: The dictionary that is part of the package, with the weights of the materials that it was reduced for.
 SHIPPED = Path(__file__).with_name("ggx_dictionary.json")
 
@@ -48,12 +50,12 @@ class Lobes:
 
     def __post_init__(self) -> None:
         if len(self.alpha) != len(self.eta) or not self.alpha:
-            raise ValueError(
+            raise InputError(
                 f'"alpha" and "eta" must have a number for each lobe, got {len(self.alpha)} and {len(self.eta)}'
             )
         for i, (alpha, eta) in enumerate(zip(self.alpha, self.eta, strict=True), 1):
             if not (((np.isnan(alpha) or 0 < alpha <= 1) and 1 < eta < np.inf) or (np.isnan(alpha) and np.isnan(eta))):
-                raise ValueError(
+                raise InputError(
                     f"lobe {i}: expected alpha in (0, 1] and eta > 1, or eta alone (diffuse, under a coat), or neither "
                     f"(Lambertian), got {alpha} and {eta}"
                 )
@@ -197,13 +199,13 @@ def check_weights(weights: np.ndarray, lobes: Lobes) -> None:
     """
     if weights.ndim != 2 or weights.shape[0] != len(lobes) or weights.shape[1] not in (1, 3):
         B = len(lobes)
-        raise ValueError(f'"weights" must have the shape ({B}, 3) or ({B}, 1), for {B} lobes, got {weights.shape}')
+        raise InputError(f'"weights" must have the shape ({B}, 3) or ({B}, 1), for {B} lobes, got {weights.shape}')
     if not np.isfinite(weights).all():
-        raise ValueError('"weights" must be finite')
+        raise InputError('"weights" must be finite')
     if (weights < 0).any():
-        raise ValueError(f'"weights" must be >= 0, got {weights.min():g}')
+        raise InputError(f'"weights" must be >= 0, got {weights.min():g}')
     if (total := weights.sum(0).max()) > 1 + SLACK:
-        raise ValueError(f'"weights" must sum to at most 1 for each colour, got {total:.7g}')
+        raise InputError(f'"weights" must sum to at most 1 for each colour, got {total:.7g}')
 
 
 def read(path: Path | str) -> tuple[Lobes, np.ndarray]:
@@ -241,13 +243,13 @@ def _read(
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(content, dict) or not {"alpha", "eta", key} <= set(content):
-            raise ValueError(f'expected an object with "alpha", "eta" and "{key}"')
+            raise InputError(f'expected an object with "alpha", "eta" and "{key}"')
         lobes = Lobes(*(tuple(_numbers(key, content[key]).tolist()) for key in ("alpha", "eta")))
         found = {name: _numbers("weights", value) for name, value in materials(content[key]).items()}
         for weights in found.values():
             check_weights(weights, lobes)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise InputError(f"{path}: {error}") from None
     return lobes, found
 
 
@@ -260,7 +262,7 @@ def _numbers(key: str, value: Any) -> np.ndarray:
     try:
         return np.array(value, dtype=np.float64)  # null is NaN
     except (TypeError, ValueError):
-        raise ValueError(f'"{key}" must be an array of numbers') from None
+        raise InputError(f'"{key}" must be an array of numbers') from None
 
 
 def _rows(weights: np.ndarray) -> str:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rimlight.edge_sampling.refusals import InputError
+
 COLUMNS = ("x", "y", "z", "ax", "ay", "az", "mu", "r", "g", "b")
 
 
@@ -40,11 +42,11 @@ class Led:
     def __post_init__(self) -> None:
         for column, value in zip(COLUMNS, self.row(), strict=True):
             if not math.isfinite(value):
-                raise ValueError(f'column "{column}": expected a finite number, got {value}')
+                raise InputError(f'column "{column}": expected a finite number, got {value}')
             if column in ("mu", "r", "g", "b") and value < 0:
-                raise ValueError(f'column "{column}": expected a number >= 0, got {value}')
+                raise InputError(f'column "{column}": expected a number >= 0, got {value}')
         if not any(self.axis):
-            raise ValueError('columns "ax", "ay", "az": the axis is zero')
+            raise InputError('columns "ax", "ay", "az": the axis is zero')
 
     def row(self) -> tuple[float, ...]:
         """Its numbers, in the order of `COLUMNS`."""
@@ -84,24 +86,24 @@ def read_leds(path: Path | str) -> list[Led]:
             what = [f"missing {', '.join(missing)}"] * bool(missing) + [f"unknown or twice {', '.join(wrong)}"] * bool(
                 wrong
             )
-            raise ValueError(f"{path}, line 1: the columns must be {','.join(COLUMNS)}; {'; '.join(what)}")
+            raise InputError(f"{path}, line 1: the columns must be {','.join(COLUMNS)}; {'; '.join(what)}")
         return [_led(header, row, f"{path}, line {reader.line_num}") for row in reader if any(map(str.strip, row))]
 
 
 def _led(header: list[str], row: list[str], where: str) -> Led:
     if len(row) > len(header):
-        raise ValueError(f"{where}: {len(row)} values for {len(header)} columns")
+        raise InputError(f"{where}: {len(row)} values for {len(header)} columns")
     values = {}
     for column, text in zip(header, [*row, *[""] * (len(header) - len(row))], strict=True):
         try:
             values[column] = float(text)
         except ValueError:
-            raise ValueError(f'{where}, column "{column}": expected a number, got "{text.strip()}"') from None
+            raise InputError(f'{where}, column "{column}": expected a number, got "{text.strip()}"') from None
     x, y, z, ax, ay, az, mu, r, g, b = (values[c] for c in COLUMNS)
     try:
         return Led((x, y, z), (ax, ay, az), mu, (r, g, b))
     except ValueError as error:
-        raise ValueError(f"{where}, {error}") from None
+        raise InputError(f"{where}, {error}") from None
 
 
 def write_leds(path: Path | str, leds: Iterable[Led]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from rimlight.edge_sampling import Geometry
 from rimlight.edge_sampling.geometry import meshes
+from rimlight.edge_sampling.refusals import InputError
 
 INTEGRATORS = ("direct_edge", "prb_edge", "direct_projective", "prb_projective", "direct", "path", "prb", "prb_basic")
 
@@ -25,18 +26,12 @@ HINTS = {
 }
 
 
-class InputError(ValueError):
-    """Something that the user can mend. The text is one line that names it."""
-
-
 @contextmanager
-def expected(*types: type[Exception], who: str = "", pattern: str = "") -> Iterator[None]:
-    """Turn exceptions of these types, with a text that matches `pattern`, into `InputError`. All others are bugs."""
+def expected(*types: type[Exception], who: str = "") -> Iterator[None]:
+    """Turn exceptions of these types into `InputError`. All others are bugs, unless they are refusals already."""
     try:
         yield
     except types as error:
-        if not re.search(pattern, str(error)):
-            raise
         raise InputError(f"{who}: {one_line(error)}" if who else one_line(error)) from error
 
 
@@ -45,7 +40,7 @@ def one_line(error: Exception) -> str:
     text = str(error).strip()
     head, traceback, tail = text.partition("Traceback (most recent call last):")
     if traceback:  # a plugin in Python failed: its last line says why
-        text = head + re.sub(r"^\w+(Error|Exception): ", "", tail.strip().splitlines()[-1])
+        text = head + re.sub(r"^(\w+Error|\w+Exception|Refusal): ", "", tail.strip().splitlines()[-1])
     text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", text).split())
     for pattern, hint in HINTS.items():
         if re.search(pattern, text):

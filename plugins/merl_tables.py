@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import replacing
 
 #: Numbers of θ_h, θ_d, φ_d and colours.
@@ -48,12 +49,12 @@ def read_merl(path: Path | str) -> np.ndarray:
     header, count = 3 * 4, int(np.prod(SHAPE))
     shape = tuple(np.frombuffer(data[:header], "<i4").tolist()) if len(data) >= header else ()
     if shape and shape != SHAPE[:3]:
-        raise ValueError(
+        raise InputError(
             f"{who}: expected 90 × 90 × 180 angles, got {' × '.join(map(str, shape))}; "
             "it is no MERL table, or one of another resolution, which must be resampled"
         )
     if len(data) != header + 8 * count:
-        raise ValueError(f"{who}: expected {header + 8 * count} bytes, got {len(data)}; fetch or copy the file again")
+        raise InputError(f"{who}: expected {header + 8 * count} bytes, got {len(data)}; fetch or copy the file again")
     stored = np.frombuffer(data, "<f8", offset=header).reshape(3, *SHAPE[:3])
     table = np.ascontiguousarray(np.moveaxis(stored, 0, -1)) * SCALE
     check(table, who, "fetch or copy the file again")
@@ -88,14 +89,14 @@ def check(table: np.ndarray, who: str, remedy: str) -> None:
         than 5 degrees above the horizon.
     """
     if table.shape != SHAPE:
-        raise ValueError(f"{who}: expected a table of shape {SHAPE}, got {table.shape}; {remedy}")
+        raise InputError(f"{who}: expected a table of shape {SHAPE}, got {table.shape}; {remedy}")
     for what, bad in (
         ("finite numbers", ~np.isfinite(table)),
         ("numbers >= 0 above the horizon", (table < 0) & (elevation() > np.radians(GRAZING))[..., None]),
     ):
         if bad.any():
             first = tuple(int(i) for i in np.unravel_index(bad.argmax(), SHAPE))
-            raise ValueError(f"{who}: expected {what}, got {table[first]:g} at {first}, {bad.sum()} in all; {remedy}")
+            raise InputError(f"{who}: expected {what}, got {table[first]:g} at {first}, {bad.sum()} in all; {remedy}")
 
 
 # ---------------------- Angles ----------------------

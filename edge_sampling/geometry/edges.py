@@ -10,6 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from rimlight.edge_sampling.refusals import InputError
+
 from . import meshes
 from .meshes import Geometry
 
@@ -115,7 +117,7 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     for i, mesh in enumerate(geometry.meshes):
         f, v = meshes.faces(mesh), meshes.vertices(mesh)
         if not np.isfinite(v).all():
-            raise ValueError(f'shape "{mesh.id()}": {int((~np.isfinite(v)).any(1).sum())} vertices are not finite')
+            raise InputError(f'shape "{mesh.id()}": {int((~np.isfinite(v)).any(1).sum())} vertices are not finite')
         face_list.append(f.astype(np.int64) + offset)
         mesh_of_face.append(np.full(len(f), i, np.uint32))
         points.append(v)

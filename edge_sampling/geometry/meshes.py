@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.refusals import Refusal
+
 from .curves import CURVES
 from .parameters import Parameter
 
@@ -77,7 +79,7 @@ class Geometry:
         known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
         for name, node, *_ in changing:
             if isinstance(node, mi.Shape) and int(node.ptr) not in known:
-                raise RuntimeError(
+                raise Refusal(
                     f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{name}" carries a gradient), but its '
                     "silhouettes cannot be sampled: only triangle meshes, spheres, disks and cylinders outside of "
                     "shape groups can move. Replace it by such a mesh, or detach it."

@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.refusals import Refusal
+
 
 @dataclass(frozen=True)
 class FilmPart:
@@ -43,7 +45,7 @@ def film_parts(sensor: mi.Sensor) -> list[FilmPart]:
         return [FilmPart(sensor, mi.ScalarVector2f(0), mi.ScalarVector2f(1))]
     children = _children(sensor)
     if any(s.film().sample_border() for s in (sensor, *children)):
-        raise RuntimeError(
+        raise Refusal(
             f'film boundary: batch sensor "{sensor.id()}" samples the border of its film, where Mitsuba mixes up the '
             'views; set "sample_border" to false.'
         )

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.refusals import Refusal
+
 #: Class names of the sensors that `Projection` knows, by plugin name.
 SENSORS = {
     "perspective": "PerspectiveCamera",
@@ -74,7 +76,7 @@ class Projection(ABC):
     def __new__(cls, sensor: mi.Sensor):
         kind = _kind(sensor)
         if kind not in SENSORS.values():
-            raise RuntimeError(
+            raise Refusal(
                 f'film boundary: sensor "{sensor.id()}" ({kind}) is not supported, use one of {", ".join(SENSORS)}, '
                 "or a batch of them"
             )

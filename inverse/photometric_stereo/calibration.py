@@ -9,6 +9,8 @@ from typing import Literal
 import numpy as np
 from tqdm import tqdm
 
+from rimlight.edge_sampling.refusals import InputError
+
 from .dataset import DIRECTIONS, INTENSITIES, LUMINANCE, read_camera, read_mask, read_names, read_pixels, unit
 from .integration import ray_matrix
 
@@ -79,7 +81,7 @@ def _outline(mask: np.ndarray) -> np.ndarray:
     y, x = np.nonzero(mask[1:] != mask[:-1])
     points = np.concatenate([np.c_[u + 0.5, v], np.c_[x, y + 0.5]])
     if len(points) < 8:
-        raise ValueError(f"ps: the ball's mask has {int(mask.sum())} pixels and no outline in the image")
+        raise InputError(f"ps: the ball's mask has {int(mask.sum())} pixels and no outline in the image")
     return points
 
 
@@ -87,7 +89,7 @@ def _check_outline(residuals: np.ndarray, radius: float) -> None:
     """In pixels."""
     off = np.sqrt(np.square(residuals).mean())
     if not off <= max(OUTLINE[0], OUTLINE[1] * radius):
-        raise ValueError(f"ps: the ball's mask is no disc: its outline is {off:.1f} pixels off a circle")
+        raise InputError(f"ps: the ball's mask is no disc: its outline is {off:.1f} pixels off a circle")
 
 
 # ---------------------- Lights at infinity ----------------------
@@ -105,7 +107,7 @@ def chrome(values: np.ndarray, ball: Ball) -> np.ndarray:
     """
     brightness = values @ LUMINANCE
     if not np.isfinite(values).all() or brightness.max() <= 0:
-        raise ValueError("no highlight: the ball is black")
+        raise InputError("no highlight: the ball is black")
     weights = np.maximum(brightness - HIGHLIGHT * brightness.max(), 0)
     n, v = ball.normals, ball.view
     directions = 2 * (n * v).sum(1, keepdims=True) * n - v
@@ -113,7 +115,7 @@ def chrome(values: np.ndarray, ball: Ball) -> np.ndarray:
     # The mean of unit vectors that scatter by an angle is shorter by half its square
     scatter = np.degrees(np.sqrt(2 * max(1 - np.linalg.norm(mean), 0)))
     if scatter > SCATTER:
-        raise ValueError(
+        raise InputError(
             "no single small highlight: what is brighter than a quarter of the brightest pixel reflects directions "
             f"that scatter by {scatter:.0f} degrees; is the picture overexposed, or are there two lights?"
         )
@@ -131,16 +133,16 @@ def matte(values: np.ndarray, ball: Ball) -> tuple[np.ndarray, np.ndarray]:
     ValueError : the ball is black, or overexposed, or its light too low.
     """
     if not np.isfinite(values).all() or values.max() <= 0:
-        raise ValueError("the ball is black")
+        raise InputError("the ball is black")
     clipped = max((values[:, c] == values[:, c].max()).mean() for c in range(3) if values[:, c].max() > 0)
     if clipped > CLIPPED:
-        raise ValueError(f"the ball is overexposed: {100 * clipped:.0f} % of its pixels have the largest value")
+        raise InputError(f"the ball is overexposed: {100 * clipped:.0f} % of its pixels have the largest value")
     n, brightness = ball.normals.astype(np.float64), (values @ LUMINANCE).astype(np.float64)
     inside = (n * ball.view).sum(1) > LEAST_COSINE
     lit = inside & (brightness > LEAST_COSINE * np.quantile(brightness, 0.99))
     for _ in range(10):
         if lit.sum() < 10:
-            raise ValueError("the light meets fewer than 10 pixels of the ball")
+            raise InputError("the light meets fewer than 10 pixels of the ball")
         b = np.linalg.lstsq(n[lit], brightness[lit], rcond=None)[0]
         direction = unit(b)
         before, lit = lit, inside & (n @ direction > LEAST_COSINE)
@@ -166,19 +168,19 @@ def calibrate(folder: Path, ball: Path, kind: Literal["chrome", "matte"]) -> tup
     ValueError : see `Ball.of_mask`, `chrome` and `matte`; names the picture. OSError.
     """
     if kind not in ("chrome", "matte"):
-        raise ValueError(f'ps: unknown kind of ball "{kind}", expected chrome or matte')
+        raise InputError(f'ps: unknown kind of ball "{kind}", expected chrome or matte')
     mask = read_mask(ball)
     surface = Ball.of_mask(mask, read_camera(folder))
     names = [name for name in read_names(folder) if (folder / name).resolve() != ball.resolve()]
     if not names:
-        raise ValueError(f'ps: there are no pictures in "{folder}"')
+        raise InputError(f'ps: there are no pictures in "{folder}"')
     found = []
     for name in tqdm(names, desc="images", disable=len(names) < 10, leave=False):
         try:
             values = read_pixels(folder / name, mask)
             found.append((chrome(values, surface), None) if kind == "chrome" else matte(values, surface))
         except ValueError as error:
-            raise ValueError(str(error) if str(error).startswith("ps: ") else f'ps: "{name}": {error}') from None
+            raise InputError(str(error) if str(error).startswith("ps: ") else f'ps: "{name}": {error}') from None
     directions = np.stack([direction for direction, _ in found])
     np.savetxt(folder / DIRECTIONS, directions, "%.9g")
     if kind == "chrome":

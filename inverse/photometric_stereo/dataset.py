@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.inverse.targets import read_picture, srgb_to_linear
 from rimlight.leds import Led, read_leds, write_leds
 
@@ -70,27 +71,27 @@ class Dataset:
     def __post_init__(self):
         P, K, channels = self.values.shape
         if self.mask.sum() != P or channels != 3:
-            raise ValueError(f"ps: values of the shape {self.values.shape} for {self.mask.sum()} pixels of the mask")
+            raise InputError(f"ps: values of the shape {self.values.shape} for {self.mask.sum()} pixels of the mask")
         if not P:
-            raise ValueError("ps: the mask is empty")
+            raise InputError("ps: the mask is empty")
         if len(self.lights) != K or self.intensities.shape != (K, 3):
-            raise ValueError(
+            raise InputError(
                 f"ps: {K} images, {len(self.lights)} lights and {len(self.intensities)} intensities: there must be as "
                 "many of each"
             )
         if K < 3:
-            raise ValueError(f"ps: at least three images are needed, got {K}")
+            raise InputError(f"ps: at least three images are needed, got {K}")
         if bad := int((~np.isfinite(self.values)).any((1, 2)).sum()):
-            raise ValueError(f"ps: {bad} pixels of the mask have values that are not finite; take them out of the mask")
+            raise InputError(f"ps: {bad} pixels of the mask have values that are not finite; take them out of the mask")
         check_camera("ps", self.camera)
         if self.near and self.camera is None:
-            raise ValueError(f"ps: lights at finite distance need a camera; write its matrix to {CAMERA}")
+            raise InputError(f"ps: lights at finite distance need a camera; write its matrix to {CAMERA}")
         if self.near and self.distance is None:
-            raise ValueError(
+            raise InputError(
                 f"ps: lights at finite distance need the distance of the object from the camera; write it to {DISTANCE}"
             )
         if self.distance is not None and not 0 < self.distance < np.inf:
-            raise ValueError(f"ps: the distance must be positive, got {self.distance}")
+            raise InputError(f"ps: the distance must be positive, got {self.distance}")
 
     @property
     def near(self) -> bool:
@@ -128,15 +129,15 @@ class Dataset:
         ValueError : lights are near already, or not on the camera's side; there is no camera or distance.
         """
         if self.near:
-            raise ValueError(f"ps: lights have positions already; take {LEDS} or {LIGHT_DISTANCE} away")
+            raise InputError(f"ps: lights have positions already; take {LEDS} or {LIGHT_DISTANCE} away")
         if not 0 < away < np.inf:
-            raise ValueError(f"ps: {LIGHT_DISTANCE}: the distance of the lights must be positive, got {away}")
+            raise InputError(f"ps: {LIGHT_DISTANCE}: the distance of the lights must be positive, got {away}")
         if (behind := self.lights[:, 2] <= 0).any():
-            raise ValueError(
+            raise InputError(
                 f"ps: light {int(behind.argmax()) + 1} is not on the side of the camera; describe it in {LEDS}"
             )
         if self.camera is None or self.distance is None:
-            raise ValueError(f"ps: near lights need {CAMERA} and {DISTANCE}, which tell where the object is")
+            raise InputError(f"ps: near lights need {CAMERA} and {DISTANCE}, which tell where the object is")
         rows, columns = np.nonzero(self.mask)
         middle = self.distance * ray_matrix(self.camera) @ (columns.mean(), rows.mean(), 1)
         offsets = self.lights * (away / self.lights[:, 2:])
@@ -159,7 +160,7 @@ class Dataset:
             return self
         mask, mean = self.blocks(step)
         if not mask.any():
-            raise ValueError(f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left")
+            raise InputError(f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left")
         camera = self.camera
         if camera is not None:  # the centre of the first coarse pixel lies (step - 1) / 2 behind that of the first
             camera = camera.copy()
@@ -262,17 +263,17 @@ def read_setup(folder: Path, *, images: int = 0) -> Setup:
     else:
         directions = _numbers(folder / DIRECTIONS, 3)
         if (lengths := np.linalg.norm(directions, axis=1)).min() == 0:
-            raise ValueError(f"ps: {DIRECTIONS}, line {lengths.argmin() + 1}: the direction is zero")
+            raise InputError(f"ps: {DIRECTIONS}, line {lengths.argmin() + 1}: the direction is zero")
         lights = directions / lengths[:, None]
         given = folder / INTENSITIES
         intensities = _numbers(given, 3) if given.is_file() else np.ones_like(lights)
     if len(lights) != len(names) or len(intensities) != len(names):
-        raise ValueError(
+        raise InputError(
             f"ps: {folder.name}: {len(names)} images, {len(lights)} lights, {len(intensities)} intensities: there must "
             "be as many of each"
         )
     if (intensities <= 0).any():
-        raise ValueError(f"ps: {folder.name}: light {int((intensities <= 0).any(1).argmax()) + 1} has no intensity")
+        raise InputError(f"ps: {folder.name}: light {int((intensities <= 0).any(1).argmax()) + 1} has no intensity")
     if 0 < images < len(names):
         chosen = np.arange(images) * len(names) // images
         names, intensities = [names[k] for k in chosen], intensities[chosen]
@@ -343,12 +344,12 @@ def read_pixels(path: Path, mask: np.ndarray) -> np.ndarray:
     picture = _numbers_of_picture(path)
     if picture.shape[:2] != mask.shape:
         (h, w), (H, W) = picture.shape[:2], mask.shape
-        raise ValueError(f'ps: "{path.name}" has {w} x {h} pixels, the mask {W} x {H}')
+        raise InputError(f'ps: "{path.name}" has {w} x {h} pixels, the mask {W} x {H}')
     pixels = picture[mask]
     if pixels.shape[1] in (2, 4):
         pixels = pixels[:, :-1]
     if pixels.shape[1] not in (1, 3):
-        raise ValueError(f'ps: "{path.name}" has {pixels.shape[1]} channels, expected grey or colours')
+        raise InputError(f'ps: "{path.name}" has {pixels.shape[1]} channels, expected grey or colours')
     if path.suffix.lower() in (".jpg", ".jpeg"):
         pixels = srgb_to_linear(pixels)
     return np.broadcast_to(pixels, (len(pixels), 3))
@@ -381,13 +382,13 @@ def _numbers(path: Path, columns: int) -> np.ndarray:
             for line in path.read_text(encoding="utf-8").splitlines()
         ]
     except ValueError as error:
-        raise ValueError(f"ps: {path.name}: {error}") from None
+        raise InputError(f"ps: {path.name}: {error}") from None
     rows = [row for row in rows if row]
     for k, row in enumerate(rows, 1):
         if len(row) != columns or not np.isfinite(row).all():
-            raise ValueError(f"ps: {path.name}, row {k}: expected finite numbers, {columns} of them, got {row}")
+            raise InputError(f"ps: {path.name}, row {k}: expected finite numbers, {columns} of them, got {row}")
     if not rows:
-        raise ValueError(f"ps: {path.name} is empty")
+        raise InputError(f"ps: {path.name} is empty")
     return np.array(rows)
 
 
@@ -400,10 +401,10 @@ def _truth(folder: Path, mask: np.ndarray) -> np.ndarray | None:
         try:
             arrays = [a for name, a in loadmat(path).items() if not name.startswith("_")]
         except (ValueError, TypeError, NotImplementedError) as error:
-            raise ValueError(f"ps: cannot read {path.name}: {error}") from None
+            raise InputError(f"ps: cannot read {path.name}: {error}") from None
         normals = next((a for a in arrays if np.ndim(a) == 3 and a.shape[2] == 3), None)
     else:
         return None
     if normals is None or normals.shape != (*mask.shape, 3):
-        raise ValueError(f"ps: {path.name} holds no normals of the size of the mask")
+        raise InputError(f"ps: {path.name} holds no normals of the size of the mask")
     return unit(normals[mask].astype(np.float64))

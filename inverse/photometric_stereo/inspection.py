@@ -11,6 +11,7 @@ from scipy import ndimage
 from tqdm import tqdm
 
 from rimlight import ggx
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.inverse.page import shrunk
 
 from . import cost, dataset, encoding, evidence, least_squares, start
@@ -115,7 +116,7 @@ def inspect(folder: Path, options: Options | None = None) -> Inspection:
         picture = dataset.read_pixels(folder / name, np.ones_like(mask)).reshape(*mask.shape, 3)
         inside, raw[:, k] = picture[mask], picture.reshape(-1, 3)[chosen]
         if not np.isfinite(inside).all():
-            raise ValueError(f'ps: "{name}" has values that are not finite; take these pixels out of the mask')
+            raise InputError(f'ps: "{name}" has values that are not finite; take these pixels out of the mask')
         largest[k] = inside.max(initial=0)
         bright[k] = (inside >= (1 - 1e-4) * largest[k]).any(1).mean() if pixels else 0
         black[k] = (inside <= 0).all(1).mean() if pixels else 0
@@ -226,7 +227,7 @@ def _estimates(sample: Dataset, options: Options) -> tuple[np.ndarray, np.ndarra
     plane = start.flat(sample)
     directions, irradiance = plane.lighting()
     if not sample.values.max() > 0:
-        raise ValueError("ps: all images are black in the mask; check the images, their exposure and the mask")
+        raise InputError("ps: all images are black in the mask; check the images, their exposure and the mask")
     counts = np.ones(sample.values.shape[:2], np.float32)
     guess = start.guess(sample, ggx.Lobes((np.nan,), (np.nan,)), counts, options)
     values = sample.luminance / np.maximum(irradiance, 1e-30) / guess.exposures

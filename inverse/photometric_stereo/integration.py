@@ -31,6 +31,8 @@ from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
+from rimlight.edge_sampling.refusals import InputError
+
 from . import laplacian
 
 log = logging.getLogger(__name__)
@@ -89,9 +91,9 @@ def integrate(
     mask = _checked_mask("integrate", mask)
     check_camera("integrate", camera, pixel_size)
     if not (bilateral is None or 0 < bilateral < np.inf):
-        raise ValueError(f'integrate: "bilateral" must be positive, got {bilateral}; 2 is usual')
+        raise InputError(f'integrate: "bilateral" must be positive, got {bilateral}; 2 is usual')
     if not tolerance > 0 or max_iterations < 1:
-        raise ValueError(f"integrate: tolerance {tolerance} and max_iterations {max_iterations} must be positive")
+        raise InputError(f"integrate: tolerance {tolerance} and max_iterations {max_iterations} must be positive")
     n = _unit_normals(normals, mask)
     rays, steps = _rays(mask, camera, pixel_size)
     cosine = -np.sum(n * rays, axis=1) / np.linalg.norm(rays, axis=1)
@@ -316,7 +318,7 @@ def depth_error(
     """
     mask = _checked_mask("depth_error", mask)
     if align not in ("offset", "scale", "rigid"):
-        raise ValueError(f'depth_error: "align" must be "offset", "scale" or "rigid", got "{align}"')
+        raise InputError(f'depth_error: "align" must be "offset", "scale" or "rigid", got "{align}"')
     for a in (depth, truth):
         _check_depth("depth_error", a, mask, positive=align == "scale" or camera is not None)
     if align == "rigid":
@@ -345,42 +347,42 @@ def depth_error(
 def _checked_mask(who: str, mask: np.ndarray) -> np.ndarray:
     mask = np.asarray(mask)
     if mask.ndim != 2 or mask.dtype != bool:
-        raise ValueError(
+        raise InputError(
             f'{who}: the mask must be an array (H, W) of bool, got {mask.dtype} {mask.shape}; "mask > 0" makes one'
         )
     if not mask.any():
-        raise ValueError(f"{who}: the mask is empty")
+        raise InputError(f"{who}: the mask is empty")
     return mask
 
 
 def check_camera(who: str, camera: np.ndarray | None, pixel_size: float = 1.0) -> None:
     if not 0 < pixel_size < np.inf:
-        raise ValueError(f'{who}: "pixel_size" must be positive, got {pixel_size}')
+        raise InputError(f'{who}: "pixel_size" must be positive, got {pixel_size}')
     if camera is None:
         return
     K = np.asarray(camera, np.float64)
     if K.shape != (3, 3) or not np.isfinite(K).all() or np.any(K[2] != (0, 0, 1)) or min(K[0, 0], K[1, 1]) <= 0:
-        raise ValueError(f"{who}: the camera must be a matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
+        raise InputError(f"{who}: the camera must be a matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
 
 
 def _check_depth(who: str, depth: np.ndarray, mask: np.ndarray, *, positive: bool) -> None:
     if np.shape(depth) != mask.shape:
-        raise ValueError(f"{who}: depth has the shape {np.shape(depth)}, the mask {mask.shape}")
+        raise InputError(f"{who}: depth has the shape {np.shape(depth)}, the mask {mask.shape}")
     bad = ~np.isfinite(np.asarray(depth)[mask])
     if bad.any():
-        raise ValueError(f"{who}: depth is not finite in {bad.sum()} pixels of the mask; take them out of the mask")
+        raise InputError(f"{who}: depth is not finite in {bad.sum()} pixels of the mask; take them out of the mask")
     if positive and np.any(np.asarray(depth)[mask] <= 0):
-        raise ValueError(f"{who}: depth of a perspective camera must be positive")
+        raise InputError(f"{who}: depth of a perspective camera must be positive")
 
 
 def _unit_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if np.shape(normals) != (*mask.shape, 3):
-        raise ValueError(f"integrate: normals have the shape {np.shape(normals)}, not {(*mask.shape, 3)} as the mask")
+        raise InputError(f"integrate: normals have the shape {np.shape(normals)}, not {(*mask.shape, 3)} as the mask")
     n = np.asarray(normals, np.float64)[mask]
     length = np.linalg.norm(n, axis=1, keepdims=True)
     bad = ~(np.isfinite(length) & (length > 0))
     if bad.any():
-        raise ValueError(
+        raise InputError(
             f"integrate: {bad.sum()} normals in the mask are not finite, or zero; take these pixels out of the mask, "
             "or give them any normal and a weight of 0"
         )
@@ -389,8 +391,8 @@ def _unit_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def _checked_weights(weights: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if np.shape(weights) != mask.shape:
-        raise ValueError(f"integrate: weights have the shape {np.shape(weights)}, the mask {mask.shape}")
+        raise InputError(f"integrate: weights have the shape {np.shape(weights)}, the mask {mask.shape}")
     w = np.asarray(weights, np.float64)[mask]
     if not (np.isfinite(w).all() and w.min() >= 0 < w.max()):
-        raise ValueError("integrate: weights in the mask must be finite, >= 0, and not all 0")
+        raise InputError("integrate: weights in the mask must be finite, >= 0, and not all 0")
     return np.maximum(w, LEAST_WEIGHT * w.max())

@@ -7,6 +7,8 @@ import pyamg
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from rimlight.edge_sampling.refusals import Refusal
+
 #: Unknowns that are solved for directly. Beyond, factorisation is slower than multigrid, and takes more memory.
 DIRECT = 200_000
 
@@ -29,5 +31,5 @@ def solve(A: sp.csr_matrix, b: np.ndarray, start: np.ndarray, *, tolerance: floa
     residuals: list[float] = []
     x = levels.solve(b, x0=start, tol=tolerance, accel="cg", maxiter=ITERATIONS, residuals=residuals)
     if residuals[-1] > 1.01 * tolerance * np.linalg.norm(b):
-        raise RuntimeError(f"integrate: no solution within {ITERATIONS} iterations")
+        raise Refusal(f"integrate: no solution within {ITERATIONS} iterations")
     return x

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 from .vectors import unit
 
 #: Trimming leaves at least so many values of a pixel, and lights that are spread at least this part as far (smallest
@@ -75,7 +77,7 @@ def check_lights(lights: np.ndarray) -> None:
     """Raises ValueError if directions, (K, 3), lie in a plane, and so do not tell normals apart."""
     size = np.linalg.svd(lights, compute_uv=False)
     if size[2] < PLANE * size[0]:
-        raise ValueError(
+        raise InputError(
             "ps: the directions of the lights are all equal, or lie in a plane, so that normals cannot be told; "
             "check light_directions.txt, and that the lights chosen are not in a row"
         )
@@ -106,7 +108,7 @@ def normals(values: np.ndarray, lights: np.ndarray, method: str = "trimmed") -> 
     ValueError : there is no such method.
     """
     if method not in METHODS:
-        raise ValueError(f'ps: unknown method "{method}", expected one of {", ".join(METHODS)}')
+        raise InputError(f'ps: unknown method "{method}", expected one of {", ".join(METHODS)}')
     return facing(METHODS[method](values.astype(np.float64), lights))
 
 

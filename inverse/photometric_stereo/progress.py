@@ -14,6 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import remove_left_over
 from rimlight.inverse import checkpoint
 
@@ -139,12 +140,12 @@ class Checkpoint:
         """Raises ValueError if a checkpoint belongs to something else, and says what differs."""
         differ = lambda a, b: ", ".join(sorted(key for key in {*a, *b} if a.get(key) != b.get(key)))
         if what := differ(facts["data"], self.belongs["data"]):
-            raise ValueError(
+            raise InputError(
                 f'ps: the data set has changed since "{self.path}" was written ({what}); put the old one back, or '
                 "reconstruct the new one into another folder"
             )
         if what := differ(facts["options"], self.belongs["options"]):
-            raise ValueError(
+            raise InputError(
                 f'ps: "{self.path}" was written with other options ({what}); give the same ones as before, or name '
                 "another folder"
             )

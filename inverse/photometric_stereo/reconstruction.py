@@ -19,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rimlight import ggx
+from rimlight.edge_sampling.refusals import InputError
 
 from . import least_squares, start
 from .alternation import Alternations, Course, State, View
@@ -85,19 +86,19 @@ class Options:
 
     def __post_init__(self):
         if len(self.resolutions) != len(self.iterations) or not self.resolutions:
-            raise ValueError(
+            raise InputError(
                 f'ps: "resolutions" and "iterations" must be as many, got {self.resolutions}, {self.iterations}'
             )
         if self.start not in least_squares.METHODS:
-            raise ValueError(f'ps: "start" must be one of {", ".join(least_squares.METHODS)}, got {self.start}')
+            raise InputError(f'ps: "start" must be one of {", ".join(least_squares.METHODS)}, got {self.start}')
         if min(self.iterations) < 1:
-            raise ValueError(f'ps: "iterations" must be at least 1 each, got {self.iterations}')
+            raise InputError(f'ps: "iterations" must be at least 1 each, got {self.iterations}')
         if not all(0 < r <= 1 and 1 / r == round(1 / r) for r in self.resolutions):
-            raise ValueError(f'ps: "resolutions" must be 1 or 1 over a whole number, got {self.resolutions}')
+            raise InputError(f'ps: "resolutions" must be 1 or 1 over a whole number, got {self.resolutions}')
         if not 0 <= self.dark < 1:
-            raise ValueError(f'ps: "dark" must be in [0, 1), got {self.dark}')
+            raise InputError(f'ps: "dark" must be in [0, 1), got {self.dark}')
         if self.max_depth < 2 or self.spp < 1 or not 0 <= self.smoothing < np.inf:
-            raise ValueError(
+            raise InputError(
                 'ps: "max_depth" must be at least 2, "spp" 1 and "smoothing" 0, got '
                 f"{self.max_depth}, {self.spp}, {self.smoothing}"
             )
@@ -179,7 +180,7 @@ def reconstruct(
     if checkpoint is not None:
         run.keep(Path(checkpoint), resume=resume)
     elif resume:
-        raise ValueError("ps: to resume, name the checkpoint")
+        raise InputError("ps: to resume, name the checkpoint")
     return run.finish(progress)
 
 

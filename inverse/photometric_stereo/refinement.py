@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from rimlight.edge_sampling.refusals import InputError
+
 from . import laplacian
 from .dataset import Dataset, unit
 from .descent import ExponentiatedGradient, NormalAdam
@@ -59,7 +61,7 @@ class Descent:
     def __post_init__(self):
         rates = self.rate, self.bsdf_rate, self.depth_rate, self.integrability
         if min(self.steps, self.lights, *rates) < 0 or not np.isfinite(rates).all() or self.spp < 1:
-            raise ValueError(f'ps: "spp" of the descent must be at least 1, other options 0, got {self}')
+            raise InputError(f'ps: "spp" of the descent must be at least 1, other options 0, got {self}')
 
 
 def descend(

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from rimlight import ggx, leds, no_collection
+from rimlight.edge_sampling.refusals import InputError
 
 from .dataset import Dataset
 from .direct import Guess, Lighting, bsdf_of, own
@@ -95,7 +96,7 @@ class Rendering:
     ):
         gc.collect()
         if not 0 <= lights <= len(data.lights) or (lights and data.near):
-            raise ValueError(
+            raise InputError(
                 f"ps: cannot render {lights} of {len(data.lights)} lights at a time"
                 + (", they are at finite distances" if data.near else "")
             )
@@ -146,7 +147,7 @@ class Rendering:
             }
         K = self.data.camera
         if (off := max(abs(K[1, 1] / K[0, 0] - 1) * H, abs(K[0, 1] / K[1, 1]) * H) / 2) > SKEWED:
-            raise ValueError(
+            raise InputError(
                 f"ps: the camera's pixels are not square: rendered, its images would be {off:.1f} pixels off; "
                 "resample them"
             )

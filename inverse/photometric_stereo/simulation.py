@@ -14,6 +14,7 @@ from scipy import ndimage
 from tqdm import tqdm
 
 from rimlight import ggx, no_collection
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import write_exr
 from rimlight.leds import Led, emitters
 from rimlight.loading import one_line
@@ -106,7 +107,7 @@ class Options:
         }
         for name, right in checks.items():
             if not right:
-                raise ValueError(f'ps: "{name}" is out of its range, got {getattr(self, name)}')
+                raise InputError(f'ps: "{name}" is out of its range, got {getattr(self, name)}')
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ def simulate(options: Options, *, progress: bool = True) -> tuple[Dataset, np.nd
     scene = mi.load_dict({"type": "scene", "object": mesh, "sensor": _sensor(N, camera), **_emitters(lights)})
     mask, normals, depth = _truth(scene, N, camera)
     if not mask.any():
-        raise ValueError("ps: the surface covers no pixel; make the images larger")
+        raise InputError("ps: the surface covers no pixel; make the images larger")
     images = _render(scene, options, progress)
     values = images.reshape(N, N, -1, 3)[mask]
     if options.noise:
@@ -253,14 +254,14 @@ def _of_mesh(x: np.ndarray, y: np.ndarray, size: float, options: Options) -> Hei
     """What the camera sees of a mesh: the highest point at each place."""
     path = Path(options.shape)
     if path.suffix.lower() not in (".obj", ".ply"):
-        raise ValueError(f'ps: unknown shape "{path}", expected sphere, bowl, folds, or a file .obj or .ply')
+        raise InputError(f'ps: unknown shape "{path}", expected sphere, bowl, folds, or a file .obj or .ply')
     if not path.is_file():
         raise FileNotFoundError(f'ps: there is no file "{path}"')
     mesh = _load({"type": path.suffix[1:].lower(), "filename": str(path), "face_normals": True})
     params = mi.traverse(mesh)
     vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3) @ _rotation(options.rotate).T
     if not mesh.face_count() or not np.isfinite(vertices).all():
-        raise ValueError(f'ps: "{path}" has no faces, or vertices that are not finite')
+        raise InputError(f'ps: "{path}" has no faces, or vertices that are not finite')
     low, extent = vertices.min(0), np.ptp(vertices, 0)
     left, bottom, right, top, back = options.crop
     first, last = low + extent * [left, bottom, back], low + extent * [right, top, 1]
@@ -277,7 +278,7 @@ def _of_mesh(x: np.ndarray, y: np.ndarray, size: float, options: Options) -> Hei
     # Every point needs neighbours, for its normal
     inside = ndimage.binary_opening(np.isfinite(depth), np.ones((2, 2)))
     if not inside.any():
-        raise ValueError(f'ps: the camera sees nothing of "{path.name}"; turn it, or show more of it')
+        raise InputError(f'ps: the camera sees nothing of "{path.name}"; turn it, or show more of it')
     depth[~inside] = np.nan
     if options.smooth:
         blur = lambda a: ndimage.gaussian_filter(a, options.smooth * DETAIL)
@@ -326,7 +327,7 @@ def bsdf(text: str) -> mi.BSDF:
         except ValueError:
             colour = []
         if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
-            raise ValueError(f'ps: expected "{kind}:R,G,B", from 0 to 1, got "{text}"')
+            raise InputError(f'ps: expected "{kind}:R,G,B", from 0 to 1, got "{text}"')
         if kind == "glaze":
             return _glaze(colour)
         return mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}})
@@ -336,7 +337,7 @@ def bsdf(text: str) -> mi.BSDF:
         if text not in materials:
             close = difflib.get_close_matches(text, materials, n=1)
             hint = f', did you mean "{close[0]}"?' if close else "; a file must end in .binary or .json"
-            raise ValueError(f'ps: unknown BSDF "{text}"{hint}')
+            raise InputError(f'ps: unknown BSDF "{text}"{hint}')
         return mi.load_dict({"type": "ggx_dictionary", "material": text})
     if not Path(text).is_file():
         raise FileNotFoundError(f'ps: there is no file "{text}"')
@@ -361,7 +362,7 @@ def _load(description: dict) -> mi.Object:
     try:
         return mi.load_dict(description)
     except RuntimeError as error:
-        raise ValueError(f'ps: cannot read "{description["filename"]}": {one_line(error)}') from None
+        raise InputError(f'ps: cannot read "{description["filename"]}": {one_line(error)}') from None
 
 
 def _sensor(N: int, camera: np.ndarray | None) -> dict:

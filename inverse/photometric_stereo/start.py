@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from rimlight import ggx
+from rimlight.edge_sampling.refusals import InputError
 
 from . import calibration, least_squares
 from .dataset import Dataset, unit
@@ -38,9 +39,9 @@ def check(data: Dataset) -> None:
     if not data.near:
         least_squares.check_lights(data.lights)
     if not data.values.max() > 0:
-        raise ValueError("ps: all images are black in the mask; check the images, their exposure and the mask")
+        raise InputError("ps: all images are black in the mask; check the images, their exposure and the mask")
     if len(data.values) < FEWEST:
-        raise ValueError(f"ps: the mask has {len(data.values)} pixels, at least {FEWEST} are needed; check mask.png")
+        raise InputError(f"ps: the mask has {len(data.values)} pixels, at least {FEWEST} are needed; check mask.png")
     if share := data.clipped.mean():
         log.warning(
             "ps: %.2g %% of the values are clipped: they equal the largest one, and do not count; expose less",

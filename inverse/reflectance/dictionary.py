@@ -21,6 +21,7 @@ from scipy.optimize import nnls
 from tqdm import tqdm
 
 from rimlight import ggx, merl_tables
+from rimlight.edge_sampling.refusals import InputError
 
 #: ε of the cost, 1/sr: below this, it is absolute errors that count. White paper has 0.3.
 EPSILON = 0.01
@@ -119,7 +120,7 @@ def reduce(
     bar = lambda items, text: tqdm(items, desc=text, leave=False, disable=not progress)
     values = {name: _values(table) for name, table in bar(tables, "read")}
     if not values:
-        raise ValueError("there are no tables")
+        raise InputError("there are no tables")
     design = _design(lobes)
     # Rows weighed as in the mean fit, so that what is left out does not matter in any
     typical = np.sqrt(_weights(np.mean(list(values.values()), axis=(0, 1))))[:, None]

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight import ggx
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.ggx import GRAZING
 
 #: Smallest roughness: at it, the half vector's tangent has a standard deviation of 0.007 along each axis.
@@ -107,7 +108,7 @@ class BlinnPhongBSDF(mi.BSDF):
         super().__init__(props)
         who = props.plugin_name()
         if mi.is_polarized:
-            raise ValueError(f"{who}: polarised variants are not supported, got {mi.variant()}")
+            raise InputError(f"{who}: polarised variants are not supported, got {mi.variant()}")
         self.diffuse_reflectance = _texture(props, "diffuse_reflectance", 0.5)
         self.specular_reflectance = _texture(props, "specular_reflectance", 0.04)
         self.roughness = _texture(props, "roughness", 0.1, positive=True)
@@ -239,7 +240,7 @@ def _texture(props: mi.Properties, name: str, default: float, positive: bool = F
     value = props.get(name, default)
     if isinstance(value, (int, float)) and not (0 <= value <= 1 and (value > 0 or not positive)):
         interval = "(0, 1]" if positive else "[0, 1]"
-        raise ValueError(f'{props.plugin_name()}: "{name}" must be in {interval}, got {value:g}')
+        raise InputError(f'{props.plugin_name()}: "{name}" must be in {interval}, got {value:g}')
     return props.get_texture(name, default)
 
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight import ggx
+from rimlight.edge_sampling.refusals import InputError
 
 #: The order of the components, as in `roughplastic`.
 GLOSSY, DIFFUSE = 0, 1
@@ -139,23 +140,23 @@ class GGXDictionaryBSDF(mi.BSDF):
         super().__init__(props)
         who = props.plugin_name()
         if mi.is_polarized or mi.is_spectral:
-            raise ValueError(f"{who}: spectral and polarised variants are not supported, got {mi.variant()}")
+            raise InputError(f"{who}: spectral and polarised variants are not supported, got {mi.variant()}")
         try:
             #: The lobes, which do not change.
             self.lobes, weights = _lobes_and_weights(props)
         except ValueError as error:
-            raise ValueError(f"{who}: {error}") from None
+            raise InputError(f"{who}: {error}") from None
         if mi.is_monochromatic and weights.shape[1] == 3:
             weights = np.array(mi.luminance(mi.Color3f(np.float32(weights.T)))).reshape(-1, 1)
         weights = np.broadcast_to(weights, (len(weights), dr.size_v(mi.UnpolarizedSpectrum)))
         scale = props.get("scale", 1.0)
         if isinstance(scale, int | float) and not scale >= 0:
-            raise ValueError(f'{who}: "scale" must be >= 0, got {scale}')
+            raise InputError(f'{who}: "scale" must be >= 0, got {scale}')
         self.scale = props.get_texture("scale") if "scale" in props else None
         self.base = props.get_texture("base") if "base" in props else None
         self._base_eta = props.get("base_eta", float("nan"))
         if not (np.isnan(self._base_eta) or self._base_eta > 1):
-            raise ValueError(f'{who}: "base_eta" must be > 1, got {self._base_eta}')
+            raise InputError(f'{who}: "base_eta" must be > 1, got {self._base_eta}')
         # In Dr.Jit's own memory: `dr.freeze` does not go with NumPy's
         self.weights = mi.TensorXf(mi.Float(weights.ravel().tolist()), shape=weights.shape)
         self._alphas, nearest = _few_alphas(self.lobes)
@@ -182,7 +183,7 @@ class GGXDictionaryBSDF(mi.BSDF):
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         shape = len(self.lobes), dr.size_v(mi.UnpolarizedSpectrum)
         if tuple(self.weights.shape) != shape:
-            raise ValueError(f'ggx_dictionary: "weights" must keep its shape {shape}, got {tuple(self.weights.shape)}')
+            raise InputError(f'ggx_dictionary: "weights" must keep its shape {shape}, got {tuple(self.weights.shape)}')
         with dr.suspend_grad():
             grey = dr.mean(dr.abs(dr.unravel(mi.UnpolarizedSpectrum, dr.detach(self.weights.array))))
             grey = dr.select(dr.isfinite(grey), grey, 0)
@@ -315,14 +316,14 @@ def _lobes_and_weights(props: mi.Properties) -> tuple[ggx.Lobes, np.ndarray]:
     if given == {"filename"}:
         return ggx.read(path)
     if given - {"filename"} != {"material"}:
-        raise ValueError(
+        raise InputError(
             'give either "weights", or both "alpha" and "eta" with them, or "filename" or "material" or both; '
             f"got {', '.join(sorted(given)) or 'nothing'}"
         )
     lobes, materials = ggx.read_dictionary(path)
     if (name := props["material"]) not in materials:
         close = difflib.get_close_matches(name, materials, n=1) or [f"one of {', '.join(materials)}"]
-        raise ValueError(f'unknown "material" {name}, did you mean {close[0]}?')
+        raise InputError(f'unknown "material" {name}, did you mean {close[0]}?')
     return lobes, materials[name]
 
 
@@ -330,7 +331,7 @@ def _array(props: mi.Properties, key: str) -> np.ndarray:
     try:
         return np.array(props[key], dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f'"{key}" must be numbers, such as an mi.TensorXf, got {type(props[key]).__name__}') from None
+        raise InputError(f'"{key}" must be numbers, such as an mi.TensorXf, got {type(props[key]).__name__}') from None
 
 
 mi.register_bsdf("ggx_dictionary", GGXDictionaryBSDF)

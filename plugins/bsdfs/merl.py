@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight import merl_tables
+from rimlight.edge_sampling.refusals import InputError
 
 N_H, N_D, N_P, _ = merl_tables.SHAPE
 
@@ -99,13 +100,13 @@ class MERLBSDF(mi.BSDF):
         super().__init__(props)
         who = props.plugin_name()
         if mi.is_polarized:
-            raise ValueError(f"{who}: polarised variants are not supported, got {mi.variant()}")
+            raise InputError(f"{who}: polarised variants are not supported, got {mi.variant()}")
         if mi.is_spectral:
-            raise ValueError(
+            raise InputError(
                 f"{who}: spectral variants are not supported, got {mi.variant()}: tables are RGB; use an rgb variant"
             )
         if ("filename" in props) == ("table" in props):
-            raise ValueError(f'{who}: give either "filename" or "table"')
+            raise InputError(f'{who}: give either "filename" or "table"')
         if "filename" in props:
             table = merl_tables.read_merl(str(mi.file_resolver().resolve(props["filename"])))
         else:
@@ -126,7 +127,7 @@ class MERLBSDF(mi.BSDF):
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if tuple(self.table.shape) != merl_tables.SHAPE:
             got = tuple(self.table.shape)
-            raise ValueError(f'merl: "table" must keep its shape {merl_tables.SHAPE}, got {got}')
+            raise InputError(f'merl: "table" must keep its shape {merl_tables.SHAPE}, got {got}')
         dr.make_opaque(self.table, self._last)
         with dr.suspend_grad():
             self._tabulate_half_vectors()
@@ -327,7 +328,7 @@ def _array(value, what: str) -> np.ndarray:
     try:
         table = np.array(value, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(
+        raise InputError(
             f"{what} must be mi.TensorXf of shape {merl_tables.SHAPE}, got {type(value).__name__}"
         ) from None
     merl_tables.check(table, what, "see rimlight.merl_tables")

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from rimlight.edge_sampling.refusals import InputError
+
 from .finite_differences import FiniteDifferences
 from .zscores import mean_and_error, z_scores
 
@@ -116,11 +118,11 @@ def compare(derivatives: np.ndarray, reference: FiniteDifferences, *, tolerance:
         np.asarray(a, np.float64) for a in (reference.mean, reference.standard_error, reference.step_error)
     )
     if len(runs) < 2 or runs.shape[1:] != r.shape:
-        raise ValueError(
+        raise InputError(
             f"compare: needs at least two runs of shape {r.shape}, got {len(runs)} of shape {runs.shape[1:]}"
         )
     if not all(np.isfinite(a).all() for a in (r, r_error, step_error)):
-        raise ValueError("compare: the reference is not finite")
+        raise InputError("compare: the reference is not finite")
     finite = bool(np.isfinite(runs).all())
     runs = np.nan_to_num(runs, posinf=0, neginf=0)  # to be able to tell what else there is
     g, g_error = mean_and_error(runs)

@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rimlight._collection import no_collection
+from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import read_exr, write_exr
 
 from .motion import Motion
@@ -83,9 +84,9 @@ def finite_differences(
     ValueError : `step`, `runs` or `spp` out of range.
     """
     if not (np.isfinite(step) and step > 0):
-        raise ValueError(f"finite differences: the step must be > 0, got {step}")
+        raise InputError(f"finite differences: the step must be > 0, got {step}")
     if runs < 2 or spp < 1:
-        raise ValueError(f"finite differences: need at least 2 runs and 1 sample per pixel, got {runs} and {spp}")
+        raise InputError(f"finite differences: need at least 2 runs and 1 sample per pixel, got {runs} and {spp}")
     integrator = integrator or mi.load_dict({"type": "path", "max_depth": max_depth})
     camera = scene.sensors()[sensor]
     differences = []

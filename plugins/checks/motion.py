@@ -11,6 +11,7 @@ import numpy as np
 
 from rimlight._collection import no_collection
 from rimlight.edge_sampling.geometry.meshes import is_positions_key
+from rimlight.edge_sampling.refusals import InputError
 
 
 class Motion:
@@ -46,20 +47,20 @@ class Motion:
         self.params = mi.traverse(scene)
         if key not in self.params:
             close = difflib.get_close_matches(key, list(self.params.keys()), n=3, cutoff=0.4)
-            raise ValueError(f'unknown parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else ""))
+            raise InputError(f'unknown parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else ""))
         if (direction is None) == (rotate is None):
-            raise ValueError(f'"{key}": give either a direction or an axis to rotate about')
+            raise InputError(f'"{key}": give either a direction or an axis to rotate about')
         value = self.params[key]
         self.key = key
         self.is_positions = is_positions_key(key)
         self.is_transform = key.endswith("to_world")
         self.is_tensor = dr.is_tensor_v(value)
         if not (self.is_positions or self.is_transform or dr.is_float_v(value)):
-            raise ValueError(f'"{key}" is of type {type(value).__name__}, it cannot be varied continuously')
+            raise InputError(f'"{key}" is of type {type(value).__name__}, it cannot be varied continuously')
         if rotate is not None and not (self.is_positions or self.is_transform):
-            raise ValueError(f'"{key}" cannot rotate: it is neither vertex positions nor a transformation')
+            raise InputError(f'"{key}" cannot rotate: it is neither vertex positions nor a transformation')
         if vertices is not None and not self.is_positions:
-            raise ValueError(f'"{key}" has no vertices to choose from')
+            raise InputError(f'"{key}" has no vertices to choose from')
 
         self.initial = type(value)(dr.detach(value))
         geometric = self.is_positions or self.is_transform
@@ -69,14 +70,14 @@ class Motion:
         )
         self.rotate = None if rotate is None else _numbers(key, "axis", rotate, {3})
         if self.rotate is not None and not np.any(self.rotate):
-            raise ValueError(f'"{key}": the axis of rotation is zero')
+            raise InputError(f'"{key}": the axis of rotation is zero')
         self.pivot = None if pivot is None else _numbers(key, "pivot", pivot, {3})
         self.moves = None
         if self.is_positions:
             p = np.array(self.initial).reshape(-1, 3)
             chosen = np.arange(len(p)) if vertices is None else np.asarray(vertices, dtype=np.int64)
             if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= len(p):
-                raise ValueError(f'"{key}": vertices must be in 0 … {len(p) - 1}, got {list(chosen)}')
+                raise InputError(f'"{key}": vertices must be in 0 … {len(p) - 1}, got {list(chosen)}')
             self.moves = np.zeros(len(p), np.float32)
             self.moves[chosen] = 1
             if self.pivot is None:
@@ -157,7 +158,7 @@ def _vector(a: np.ndarray) -> mi.Vector3f:
 def _numbers(key: str, what: str, values: Sequence[float], sizes: set[int]) -> np.ndarray:
     a = np.asarray(values, dtype=np.float32).reshape(-1)
     if a.size not in sizes:
-        raise ValueError(f'"{key}": the {what} needs {" or ".join(map(str, sorted(sizes)))} numbers, got {a.size}')
+        raise InputError(f'"{key}": the {what} needs {" or ".join(map(str, sorted(sizes)))} numbers, got {a.size}')
     if not np.isfinite(a).all():
-        raise ValueError(f'"{key}": the {what} must be finite, got {list(map(float, a))}')
+        raise InputError(f'"{key}": the {what} must be finite, got {list(map(float, a))}')
     return a

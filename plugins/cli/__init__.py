@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from rimlight.loading import InputError
+from rimlight.edge_sampling.refusals import InputError, Refusal
 
 from ._commands import commands
 
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     try:
         return command.run()
-    except InputError as error:
+    except (InputError, Refusal) as error:
         print(f"rimlight: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -17,11 +17,11 @@ from rimlight import pictures
 from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
 from rimlight.edge_sampling.geometry.meshes import is_positions_key
 from rimlight.exr import write_exr
-from rimlight.loading import InputError, expected, load_integrator, use_variant
+from rimlight.loading import InputError, load_integrator, use_variant
 
 from . import _loading
 from ._loading import at_least
-from ._shared import REFUSAL, OnMotion, OnScene, OnSensor, accumulate, progress, seeds, write_image, writing
+from ._shared import OnMotion, OnScene, OnSensor, accumulate, progress, seeds, write_image, writing
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,7 @@ class PlanCommand(OnSensor):
             for key, _, _ in _loading.differentiable(scene)
             if is_positions_key(key) or key == _loading.camera_key(scene, self.sensor)
         ]
-        with expected(ValueError, RuntimeError, pattern=REFUSAL):
-            print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
+        print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
         return 0
 
 

@@ -31,7 +31,6 @@ from rimlight.inverse.photometric_stereo import (
 from rimlight.loading import InputError, expected, use_variant
 
 from ._loading import at_least, check_output
-from ._shared import REFUSAL
 
 #: Of a run that has not finished.
 CHECKPOINT = "checkpoint.npz"
@@ -67,7 +66,7 @@ class Run:
         with expected(OSError, ValueError):
             self._check_memory()
             data, truth = dataset.read(self.folder, images=self.images), _true_depth(self.folder)
-        with expected(OSError), expected(ValueError, RuntimeError, pattern=REFUSAL):
+        with expected(OSError):
             return self._reconstruct(data, truth)
 
     def _done(self) -> bool:
@@ -155,7 +154,7 @@ class Simulate:
         if (self.out / dataset.NAMES).exists():
             raise InputError(f'OUT: "{self.out}" holds a data set already; remove it, or name another folder')
         use_variant(self.variant)
-        with expected(OSError), expected(ValueError, pattern=REFUSAL):
+        with expected(OSError):
             data, depth = simulation.simulate(self.options, progress=sys.stderr.isatty())
             simulation.write(self.out, data, depth, self.options)
         pixels, K, _ = data.values.shape
@@ -176,7 +175,7 @@ class Calibrate:
 
     def run(self) -> int:
         use_variant("llvm_ad_rgb")
-        with expected(OSError), expected(ValueError, pattern=REFUSAL):
+        with expected(OSError):
             directions, intensities = calibration.calibrate(self.folder, self.ball, self.kind)
         files = [dataset.DIRECTIONS] + [dataset.INTENSITIES] * (intensities is not None)
         print(f"{len(directions)} lights: {', '.join(str(self.folder / name) for name in files)}")
@@ -195,7 +194,7 @@ class Inspect:
     def run(self) -> int:
         check_output(self.out, folder=False)
         use_variant("llvm_ad_rgb")
-        with expected(OSError), expected(ValueError, pattern=REFUSAL):
+        with expected(OSError):
             found = inspection.inspect(self.folder)
             inspection_page.write(self.out, found, title=f"Data set: {self.folder.resolve().name}")
         for name, value in inspection.table(found):

@@ -15,7 +15,6 @@ from rimlight.inverse import reflectance
 from rimlight.loading import InputError, expected
 
 from ._loading import at_least, check_output
-from ._shared import REFUSAL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +72,7 @@ class Reduce:
             raise InputError(f'there are no files *.binary in "{self.folder}"')
         with expected(ValueError):
             candidates = reflectance.candidates(self.alpha_range, self.eta_range, self.candidates, self.diffuse)
-        with expected(ValueError, OSError, pattern=REFUSAL):
+        with expected(OSError):
             lobes, weights, errors = reflectance.reduce(
                 ((path.stem, merl_tables.read_merl(path)) for path in paths),
                 candidates,

@@ -8,6 +8,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 
 def rows(props: mi.Properties, key: str, width: int) -> np.ndarray | None:
     """The property `key`, or the file that `key_file` names: (K, width), or None if there is neither.
@@ -23,7 +25,7 @@ def rows(props: mi.Properties, key: str, width: int) -> np.ndarray | None:
     """
     who, file = props.plugin_name(), f"{key}_file"
     if key in props and file in props:
-        raise ValueError(f'{who}: give either "{key}" or "{file}", not both')
+        raise InputError(f'{who}: give either "{key}" or "{file}", not both')
     if file in props:
         return _check(
             read_rows(str(mi.file_resolver().resolve(props[file])), who), f'{who}: "{file}" {props[file]}', width
@@ -40,7 +42,7 @@ def rows(props: mi.Properties, key: str, width: int) -> np.ndarray | None:
         try:
             value = np.array(value, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ValueError(
+            raise InputError(
                 f"{what} must be numbers: a vector, a colour, a string, or in Python "
                 f"mi.TensorXf of shape (K, {width}); got {type(value).__name__}"
             ) from None
@@ -72,9 +74,9 @@ def _parse(texts: list[str], what: str, unit: str) -> np.ndarray:
         try:
             row = [float(word) for word in text.split()]
         except ValueError:
-            raise ValueError(f'{what}, {unit} {number}: expected numbers, got "{text.strip()}"') from None
+            raise InputError(f'{what}, {unit} {number}: expected numbers, got "{text.strip()}"') from None
         if row and found and len(row) != len(found[0]):
-            raise ValueError(f"{what}, {unit} {number}: {len(row)} numbers, but {len(found[0])} in those before")
+            raise InputError(f"{what}, {unit} {number}: {len(row)} numbers, but {len(found[0])} in those before")
         if row:
             found.append(row)
     return np.array(found)
@@ -83,8 +85,8 @@ def _parse(texts: list[str], what: str, unit: str) -> np.ndarray:
 def _check(value: np.ndarray, what: str, width: int) -> np.ndarray:
     if value.ndim != 2 or value.shape[1] != width or len(value) == 0:
         shape = " × ".join(map(str, value.shape)) or "a single number"
-        raise ValueError(f"{what} must have {width} number(s) a row, and at least one row; got {shape}")
+        raise InputError(f"{what} must have {width} number(s) a row, and at least one row; got {shape}")
     bad = np.flatnonzero(~np.isfinite(value).all(1))
     if len(bad):
-        raise ValueError(f"{what}: row {bad[0] + 1} is not finite: {value[bad[0]].tolist()}")
+        raise InputError(f"{what}: row {bad[0] + 1} is not finite: {value[bad[0]].tolist()}")
     return value

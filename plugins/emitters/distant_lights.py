@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 from ._rows import rows, tensor
 
 #: Where the samples of a light lie, in scene units: beyond every scene. An emitter in Python is not told its size.
@@ -101,19 +103,19 @@ class DistantLights(mi.Emitter):
         who = props.plugin_name()
         directions = rows(props, "directions", 3)
         if directions is None:
-            raise ValueError(f'{who}: give "directions", three numbers for each light, or "directions_file"')
+            raise InputError(f'{who}: give "directions", three numbers for each light, or "directions_file"')
         zero = np.flatnonzero(~directions.any(1))
         if len(zero):
-            raise ValueError(f"{who}: the direction of light {zero[0] + 1} is zero")
+            raise InputError(f"{who}: the direction of light {zero[0] + 1} is zero")
         #: Number of lights. The background is none of them.
         self.light_count = len(directions)
         irradiance = self._for_each(who, "irradiance", rows(props, "irradiance", 3), np.ones((1, 3)))
         radius = self._for_each(who, "angular_radius", rows(props, "angular_radius", 1), np.zeros((1, 1)))[:, 0]
         if (irradiance < 0).any():
             k = np.flatnonzero((irradiance < 0).any(1))[0]
-            raise ValueError(f'{who}: "irradiance" must be >= 0, got {irradiance[k].tolist()} for light {k + 1}')
+            raise InputError(f'{who}: "irradiance" must be >= 0, got {irradiance[k].tolist()} for light {k + 1}')
         if (radius < 0).any() or (radius >= 90).any():
-            raise ValueError(f'{who}: "angular_radius" must be from 0 to below 90 degrees, got {radius.tolist()}')
+            raise InputError(f'{who}: "angular_radius" must be from 0 to below 90 degrees, got {radius.tolist()}')
         self.background = props.get_emissive_texture("background") if "background" in props else None
         self._discs = bool(radius.any())
 
@@ -129,7 +131,7 @@ class DistantLights(mi.Emitter):
     def _for_each(self, who: str, key: str, value: np.ndarray | None, default: np.ndarray) -> np.ndarray:
         value = default if value is None else value
         if len(value) not in (1, self.light_count):
-            raise ValueError(
+            raise InputError(
                 f'{who}: "{key}" has {len(value)} rows for {self.light_count} lights; give as many, or one'
             )
         return value
@@ -150,10 +152,10 @@ class DistantLights(mi.Emitter):
         for key, shape in {"directions": (K, 3), "irradiance": (K, 3)}.items():
             if tuple(getattr(self, key).shape) != shape:
                 got = tuple(getattr(self, key).shape)
-                raise ValueError(f'distant_lights: "{key}" must keep its shape {shape}, got {got}')
+                raise InputError(f'distant_lights: "{key}" must keep its shape {shape}, got {got}')
         if dr.width(self.angular_radius) not in (1, K):
             got = dr.width(self.angular_radius)
-            raise ValueError(f'distant_lights: "angular_radius" must be 1 number or {K}, got {got}')
+            raise InputError(f'distant_lights: "angular_radius" must be 1 number or {K}, got {got}')
         with dr.suspend_grad():
             flux = mi.luminance(dr.abs(dr.unravel(mi.Color3f, dr.detach(self.irradiance.array))))
             total = dr.sum(flux)

@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 
 class Led(mi.Emitter):
     r"""
@@ -78,17 +80,17 @@ class Led(mi.Emitter):
         who = props.plugin_name()
         if "to_world" in props:
             if "position" in props or "axis" in props:
-                raise ValueError(f'{who}: give either "to_world", or "position" and "axis"')
+                raise InputError(f'{who}: give either "to_world", or "position" and "axis"')
             to_world = np.array(props["to_world"].matrix)
             position, axis = to_world[:3, 3], to_world[:3, 2]
         else:
             position, axis = props.get("position", [0, 0, 0]), props.get("axis", [0, 0, 1])
         position, axis = _vector(who, "position", position), _vector(who, "axis", axis)
         if not any(axis):
-            raise ValueError(f'{who}: "axis" must not be zero')
+            raise InputError(f'{who}: "axis" must not be zero')
         mu = props.get("mu", 1.0)
         if isinstance(mu, bool) or not isinstance(mu, int | float) or not 0 <= mu < np.inf:
-            raise ValueError(f'{who}: "mu" must be a number >= 0, got {mu}')
+            raise InputError(f'{who}: "mu" must be a number >= 0, got {mu}')
         self.intensity = props.get_emissive_texture("intensity", 1.0)
         self.position, self.axis, self.mu = mi.Point3f(position), mi.Vector3f(axis), mi.Float(mu)
         self.m_flags = mi.EmitterFlags.DeltaPosition
@@ -174,9 +176,9 @@ def _vector(who: str, key: str, value: Any) -> list[float]:
     try:
         vector = np.array(value, dtype=np.float64).reshape(3).tolist()
     except (TypeError, ValueError):
-        raise ValueError(f'{who}: "{key}" must be three numbers, got {value}') from None
+        raise InputError(f'{who}: "{key}" must be three numbers, got {value}') from None
     if not np.isfinite(vector).all():
-        raise ValueError(f'{who}: "{key}" must be finite, got {vector}')
+        raise InputError(f'{who}: "{key}" must be finite, got {vector}')
     return vector
 
 

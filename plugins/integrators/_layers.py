@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.refusals import InputError, Refusal
+
 
 @dataclass(frozen=True)
 class LayerSamples:
@@ -49,9 +51,9 @@ class Layers:
         self.shape = (self.size[1], self.size[0], self.stride)
         length = self.shape[0] * self.shape[1] * self.shape[2]
         if length >= 2**32:
-            raise RuntimeError(f"rig: an image of {self.shape} has more than 2^32 numbers; use a crop window")
+            raise Refusal(f"rig: an image of {self.shape} has more than 2^32 numbers; use a crop window")
         if data is not None and tuple(data.shape) != self.shape:
-            raise ValueError(f"rig: the gradient must be of the image's shape {self.shape}, got {tuple(data.shape)}")
+            raise InputError(f"rig: the gradient must be of the image's shape {self.shape}, got {tuple(data.shape)}")
         self.data = dr.zeros(mi.Float, length) if data is None else data.array
         self.filter = None if film.rfilter().is_box_filter() else film.rfilter()
         self.scale = None

@@ -23,6 +23,7 @@ from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.cut_curves import cut_curves
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, vertices
 from rimlight.edge_sampling.rays import extent
+from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
 #: What perfect mirrors and glass do.
@@ -254,7 +255,7 @@ class Media:
             params = mi.traverse(medium)
             for key in params.properties:
                 if dr.grad_enabled(params[key]):
-                    raise RuntimeError(
+                    raise Refusal(
                         f'{who}: "{name}.{key}" ({medium.class_name()}) carries a gradient, but participating media '
                         "are not supported. Detach it, or use Mitsuba's prbvolpath."
                     )

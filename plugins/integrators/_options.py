@@ -6,6 +6,8 @@ from difflib import get_close_matches
 
 import mitsuba as mi
 
+from rimlight.edge_sampling.refusals import InputError
+
 #: Properties of Mitsuba's projective integrators that edge sampling has no use for. A scene file may keep them, so that
 #: one word is enough to switch.
 PROJECTIVE = ("guiding", "guiding_proj", "guiding_rounds", "project_seed")
@@ -29,7 +31,7 @@ def check_options(props: mi.Properties, known: tuple[str, ...], idle: tuple[str,
         if key not in (*PROJECTIVE, *idle):
             near = get_close_matches(key, known, n=1)
             remedy = f'did you mean "{near[0]}"?' if near else f"known are {', '.join(known)}."
-            raise ValueError(f'{who}: unknown property "{key}", {remedy}')
+            raise InputError(f'{who}: unknown property "{key}", {remedy}')
         props.mark_queried(key)
         found.append(f'"{key}"')
     if found:

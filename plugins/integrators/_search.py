@@ -31,6 +31,7 @@ from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mappe
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
+from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
 from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits
@@ -139,7 +140,7 @@ class BoundarySearch:
 
     def _refuse_while_recording(self) -> None:
         if dr.flag(dr.JitFlag.FreezingScope):
-            raise RuntimeError(
+            raise Refusal(
                 f"{self.who}: a frozen function cannot find the edges. Let it do so before: "
                 "`@dr.freeze(state_fn=lambda scene, integrator, *_: integrator.find_boundaries(scene))`."
             )
@@ -154,7 +155,7 @@ class BoundarySearch:
         camera = not still and any(dr.grad_enabled(value) for _, value in mi.traverse(sensor).items())
         if camera and geometry.others:
             names = ", ".join(f'"{s.id()}" ({s.class_name()})' for s in geometry.others)
-            raise RuntimeError(
+            raise Refusal(
                 f"{self.who}: the camera moves past {names}, whose silhouettes cannot be sampled yet. "
                 "Replace them by meshes."
             )

@@ -13,6 +13,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from rimlight._collection import no_collection
 from rimlight._plan import Plan
+from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.channels import ChannelSample, ChannelsOnFilmTerm, ChannelsTerm
 from rimlight.terms.sampling import over_film
 from rimlight.terms.term import FilmSamples, Job
@@ -141,11 +142,11 @@ class AOVEdgeIntegrator(EdgeIntegrator):
         self.nested = {key: props[key] for key in keys if isinstance(props[key], mi.Integrator)}
         self.OPTIONS = (*self.OPTIONS, *self.nested)
         if not isinstance(props.get("aovs", None), str):
-            raise ValueError(f'{who}: "aovs" must list channels, such as "depth:depth, nn:sh_normal"')
+            raise InputError(f'{who}: "aovs" must list channels, such as "depth:depth, nn:sh_normal"')
         self.channels = Channel.parse(who, props["aovs"])
         twice = set(self.nested) & {c.name for c in self.channels}
         if twice:
-            raise ValueError(f'{who}: the integrator and the channel "{twice.pop()}" have one name')
+            raise InputError(f'{who}: the integrator and the channel "{twice.pop()}" have one name')
         # Of paths of one segment: nothing is reflected.
         super().__init__(props, max_depth=1)
         self.search = ChannelSearch(self.name, self.channels)
@@ -200,9 +201,7 @@ class AOVEdgeIntegrator(EdgeIntegrator):
     def _develop(self, film, terms, values):
         """The channels that the film makes of `values` at the positions of `terms`: (H, W, C)."""
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            raise RuntimeError(
-                f"{self.name}: a film of the class {film.class_name()} cannot hold channels, use a hdrfilm"
-            )
+            raise Refusal(f"{self.name}: a film of the class {film.class_name()} cannot hold channels, use a hdrfilm")
         film.prepare([name for c in self.channels for name in c.components])
         for term, value in zip(terms, values, strict=True):
             block = film.create_block()
@@ -226,7 +225,7 @@ class AOVEdgeIntegrator(EdgeIntegrator):
         extra = {key: len(nested.aov_names()) for key, nested in self.nested.items()}
         base, rest = divmod(width - self.count - sum(extra.values()), max(len(extra), 1))
         if rest or base < 0 or (base and not extra):
-            raise ValueError(f"{self.name}: an image with {width} channels is not one of this integrator")
+            raise InputError(f"{self.name}: an image with {width} channels is not one of this integrator")
         widths = {key: base + count for key, count in extra.items()}
         widths |= {c.name: len(c.components) for c in self.channels}
         ends = list(accumulate(widths.values()))
@@ -244,7 +243,7 @@ class AOVEdgeIntegrator(EdgeIntegrator):
         if name not in layout:
             near = get_close_matches(name, layout, n=1)
             remedy = f'did you mean "{near[0]}"?' if near else f"it has {', '.join(layout)}."
-            raise ValueError(f'{self.name}: an image has no channel "{name}"; {remedy}')
+            raise InputError(f'{self.name}: an image has no channel "{name}"; {remedy}')
         return image[:, :, layout[name]]
 
     def _tracer(self, scene: mi.Scene, spp: int) -> ChannelTracer:

@@ -10,6 +10,7 @@ from rimlight._collection import no_collection
 from rimlight._plan import Plan, names
 from rimlight.edge_sampling import Batch
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.order import TERMS
 from rimlight.terms.sampling import Counts
 from rimlight.terms.term import FilmSamples, Job, Sample, Term
@@ -65,7 +66,7 @@ class EdgeIntegrator(ADIntegrator):
         self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
         self.name = props.plugin_name()
         if mi.is_polarized:
-            raise ValueError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
+            raise InputError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         self.search = BoundarySearch(self.name, self.depths, planes=self.PLANES, from_points=self.FROM_POINTS)
         self._warned: set[str] = set()
@@ -73,7 +74,7 @@ class EdgeIntegrator(ADIntegrator):
     def _sample_count(self, props: mi.Properties, key: str) -> int | None:
         value = props.get(key, None)
         if value is not None and (not is_whole(value) or value < 0):
-            raise ValueError(f'{self.name}: "{key}" must be a whole number >= 0, got {value}')
+            raise InputError(f'{self.name}: "{key}" must be a whole number >= 0, got {value}')
         return value
 
     def to_string(self) -> str:
@@ -96,7 +97,7 @@ class EdgeIntegrator(ADIntegrator):
         mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
         """
         if params is not None and not any(dr.grad_enabled(v) for v in values_of(params).values()):
-            raise RuntimeError(f"{self.name}: none of the parameters carries a gradient")
+            raise Refusal(f"{self.name}: none of the parameters carries a gradient")
         with dr.suspend_grad():
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Forward)
             job.boundaries.refit()
@@ -193,7 +194,7 @@ class EdgeIntegrator(ADIntegrator):
         dr.enable_grad(probe)
         # Our own calls suspend gradients.
         if dr.grad_enabled(probe) and any(dr.grad_enabled(v) for v in values_of(mi.traverse(scene)).values()):
-            raise RuntimeError(
+            raise Refusal(
                 f"{self.name}: an integrator around it, such as Mitsuba's aov, differentiates its samples, and would "
                 "lack the motion of visibility. Use aov_edge around it, which has the same syntax; or render the image "
                 "alone, within dr.suspend_grad()."

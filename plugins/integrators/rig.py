@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from rimlight._collection import no_collection
 from rimlight.edge_sampling import FilmPart, Lights, stratified
+from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.sampling import in_a_row, over_film, seed_of
 from rimlight.terms.term import Job
 
@@ -120,7 +121,7 @@ class RigIntegrator(EdgeIntegrator):
         values = {key: _whole(who, props, key, *limit) for key, limit in limits.items()}
         super().__init__(props, max_depth=values["max_depth"], rr_depth=values["rr_depth"])
         if mi.is_spectral:
-            raise ValueError(f"{who}: spectral variants are not supported, got {mi.variant()}")
+            raise InputError(f"{who}: spectral variants are not supported, got {mi.variant()}")
         self.lights_per_path = values["lights_per_path"]
         self.pixel_density: mi.Float | None = None
 
@@ -147,7 +148,7 @@ class RigIntegrator(EdgeIntegrator):
         mi.TensorXf, (H, W, 3 K), linear radiance per unit of the parameter.
         """
         if params is not None and not dr.grad_enabled(dict(params)):
-            raise RuntimeError(f"{self.name}: none of the parameters carries a gradient")
+            raise Refusal(f"{self.name}: none of the parameters carries a gradient")
         with dr.suspend_grad():
             image = self._differentiate(scene, sensor, seed, spp, None).image()
         report_image(self.name, image)
@@ -225,7 +226,7 @@ class RigIntegrator(EdgeIntegrator):
         film = sensor.film()
         size, count = mi.ScalarVector2u(film.crop_size()), dr.width(self.pixel_density)
         if count != size.x * size.y or not film.rfilter().is_box_filter():
-            raise RuntimeError(
+            raise Refusal(
                 f'{self.name}: "pixel_density" needs a box filter, and a number for each of {size.x} x {size.y} '
                 f"pixels, got {count}"
             )
@@ -257,16 +258,14 @@ class RigIntegrator(EdgeIntegrator):
                 continue
             who = f'{self.name}: "{e.id()}" ({e.class_name()})'
             if getattr(e, "background", None) is not None:
-                raise RuntimeError(
-                    f"{who} has a background, which is none of its lights; make it an emitter of its own"
-                )
+                raise Refusal(f"{who} has a background, which is none of its lights; make it an emitter of its own")
             if mirrors or not self.hide_emitters:
                 where = "in perfect mirrors; make these rough" if mirrors else 'directly; set "hide_emitters"'
-                raise RuntimeError(f"{who} has several lights, and which of them is seen is unknown {where}")
+                raise Refusal(f"{who} has several lights, and which of them is seen is unknown {where}")
         lights = Lights(scene)
         if len(lights) < max(self.lights_per_path, 1):
             few = f'only {len(lights)} of "lights_per_path" {self.lights_per_path}' if len(lights) else "no"
-            raise RuntimeError(f"{self.name}: the scene has {few} lights")
+            raise Refusal(f"{self.name}: the scene has {few} lights")
         return lights
 
     def _paths(self, scene) -> LightPaths:
@@ -281,7 +280,7 @@ def _whole(who: str, props: mi.Properties, key: str, default: int, least: int, m
     value = props.get(key, default)
     if not is_whole(value) or value < least or (most is not None and value > most):
         wanted = f">= {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f'{who}: "{key}" must be a whole number {wanted}, got {value}')
+        raise InputError(f'{who}: "{key}" must be a whole number {wanted}, got {value}')
     return value
 
 

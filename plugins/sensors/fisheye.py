@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.projection.sensors import equidistant, from_equidistant
+from rimlight.edge_sampling.refusals import InputError
 
 FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
 
@@ -84,11 +85,11 @@ class FisheyeSensor(mi.Sensor):
         who = props.plugin_name()
         fov, self.fov_axis = props.get("fov", 180.0), props.get("fov_axis", "x")
         if not 0 < fov <= 360:
-            raise ValueError(f'{who}: "fov" must be above 0 and at most 360 degrees, got {fov}')
+            raise InputError(f'{who}: "fov" must be above 0 and at most 360 degrees, got {fov}')
         if self.fov_axis not in FOV_AXES:
-            raise ValueError(f'{who}: "fov_axis" must be one of {", ".join(FOV_AXES)}, got "{self.fov_axis}"')
+            raise InputError(f'{who}: "fov_axis" must be one of {", ".join(FOV_AXES)}, got "{self.fov_axis}"')
         if props.get("to_world", mi.ScalarTransform4f()).has_scale():
-            raise ValueError(f'{who}: "to_world" must not scale: the angles would no longer be those of the film')
+            raise InputError(f'{who}: "to_world" must not scale: the angles would no longer be those of the film')
         self.fov = mi.Float(fov)
         self.m_needs_sample_3 = False
         self.parameters_changed([])

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
+from rimlight.edge_sampling.refusals import Refusal
+
 #: What the seed of a call is changed by for each term (exclusive or), so that no two share their random numbers. The
 #: interior term has the seed itself: its samples are those of the image.
 SALT = {"film boundary": 0xFFFFFFFF, "shadows from lights": 0xAAAAAAAA, "edges from points": 0x55555555}
@@ -78,7 +80,7 @@ def over_film(
     spp = sampler.sample_count()
     count = width * height * spp
     if count > 2**32:
-        raise RuntimeError(
+        raise Refusal(
             f"{count} samples in one wavefront exceed 2^32: use fewer samples per pixel and average several seeds"
         )
     sampler.set_samples_per_wavefront(spp)

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.parametrisation import seen_by_camera
+from rimlight.edge_sampling.refusals import InputError
 
 from .tracer import PathTracer
 
@@ -69,18 +70,18 @@ class Channel:
             name, _, rest = token.partition(":")
             kind, _, shape = rest.partition(":")
             if not name or not kind or (kind == "mask") != bool(shape):
-                raise ValueError(
+                raise InputError(
                     f'{who}: "aovs" must consist of <name>:<type>, or <name>:mask:<id of a shape>, got "{token}"'
                 )
             if kind not in KINDS:
                 near = get_close_matches(kind, KINDS, n=1)
                 remedy = f'did you mean "{near[0]}"?' if near else f"known are {', '.join(KINDS)}."
-                raise ValueError(f'{who}: "{token}" in "aovs" has the unknown type "{kind}", {remedy}')
+                raise InputError(f'{who}: "{token}" in "aovs" has the unknown type "{kind}", {remedy}')
             channels.append(Channel(name, kind, shape))
         names = [c.name for c in channels]
         if not names or len(set(names)) < len(names):
             what = "has a name twice" if names else "is empty"
-            raise ValueError(f'{who}: "aovs" {what}, got "{text}"')
+            raise InputError(f'{who}: "aovs" {what}, got "{text}"')
         return tuple(channels)
 
 
@@ -173,7 +174,7 @@ class ChannelTracer(PathTracer):
             remedy = f'did you mean "{near[0]}"?' if near else f"it has {listed or 'none with an id'}."
             if "" in ids:
                 remedy += " Mitsuba has merged meshes of equal materials: load the scene with optimize=False."
-            raise ValueError(
+            raise InputError(
                 f'{self.name}: the mask "{channel.name}" asks for the shape "{channel.shape}", which the scene does '
                 f"not have; {remedy}"
             )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.refusals import Refusal
+
 from .paths import Vertex
 from .scattering import Next, Numbers
 
@@ -26,7 +28,7 @@ class Log:
         width = self.width
         n = width * max(last + 1 - first, 1)
         if n * max(3, dr.size_v(mi.Spectrum)) >= 2**32:
-            raise RuntimeError(
+            raise Refusal(
                 f"{width} samples of paths of up to {last} vertices are more than a table can hold: use fewer samples "
                 'per pixel and average several seeds, or a lower "max_depth"'
             )

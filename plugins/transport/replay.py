@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
+from rimlight.edge_sampling.refusals import Refusal
 
 from .log import Log
 from .paths import Depths, Vertex, choose_vertex, step
@@ -392,9 +393,7 @@ def written(
     last = depths.max_depth
     if last > LONG:
         if dr.flag(dr.JitFlag.FreezingScope):
-            raise RuntimeError(
-                f'a frozen function cannot count the vertices of paths: set "max_depth" to at most {LONG}'
-            )
+            raise Refusal(f'a frozen function cannot count the vertices of paths: set "max_depth" to at most {LONG}')
         last = 2 + int(dr.max(last_of(follow(None)))[0])
     log = Log(scene, like, first, last)
     found = follow(log)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rimlight import inverse, pictures, scenes
-from rimlight.inverse import classifier, fitting, free_parameters, problem, report, reproduce
+from rimlight.inverse import classifier, fitting, free_parameters, losses, problem, report, reproduce
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
 from rimlight.scenes import traffic_sign
 
@@ -72,11 +72,11 @@ def posed(**options) -> Problem:
 @pytest.mark.parametrize("loss", [LOSS, Loss(norm="classifier", rise={"a": 5}), Loss(norm="classifier", fall={"a": 0})])
 def test_the_loss_is_a_sum_of_log_probabilities(stand_in, loss):
     image = np.random.default_rng(1).uniform(0, 1, (6, 8, 3))
-    value, gradient, scores = classifier.value_and_gradient(loss, image)
-    log = lambda classes: sum(np.log(scores[label]) for label in classes)
+    value, gradient, scores = losses.function(loss)(image)
+    log = lambda classes: sum(np.log(scores[f"probability of {label}"]) for label in classes)
     assert value == pytest.approx(log(loss.fall) - log(loss.rise))
-    assert scores == classifier.probabilities(loss, image)
-    at = lambda x: classifier.value_and_gradient(loss, x)[0]
+    assert scores.keys() == {f"probability of {label}" for label in loss.rise | loss.fall}
+    at = lambda x: losses.function(loss)(x)[0]
     change, h = np.random.default_rng(2).standard_normal(image.shape), 1e-5
     expected = (at(image + h * change) - at(image - h * change)) / (2 * h)
     assert np.sum(gradient * change) == pytest.approx(expected, rel=1e-6)
@@ -134,39 +134,36 @@ def test_the_network_knows_a_cup_of_coffee(true_network):
 def test_fits_and_their_scores(stand_in, tmp_path):
     found = fitting.fit(posed(), progress=False, out=tmp_path)
     assert found.status == "finished" and not found.errors and not found.floors and not found.silent
-    assert found.scores.keys() == {"lamp", "triangle", "kite"}
+    assert found.scores.keys() == {f"probability of {label}" for label in ("lamp", "triangle", "kite")}
     assert all(p.shape == (20,) and (p > 0).all() and (p < 1).all() for p in found.scores.values())
-    np.testing.assert_allclose(
-        found.losses, np.log(found.scores["triangle"] * found.scores["kite"] / found.scores["lamp"]), rtol=1e-9
-    )
+    of = lambda label: found.scores[f"probability of {label}"]
+    np.testing.assert_allclose(found.losses, np.log(of("triangle") * of("kite") / of("lamp")), rtol=1e-9)
     (view,), (measures,) = found.views, found.measures
     np.testing.assert_allclose(view.start, view.target, atol=0.5)  # the scene as its file has it
     rose, fell = (measures[f"probability of {label}"] for label in ("lamp", "triangle"))
-    assert rose == (
-        classifier.probabilities(LOSS, view.start)["lamp"],
-        classifier.probabilities(LOSS, view.result)["lamp"],
-    )
+    of_image = lambda image: losses.function(LOSS)(image)[2]["probability of lamp"]
+    assert rose == (of_image(view.start), of_image(view.result))
     assert np.log(rose[1] / rose[0]) - np.log(fell[1] / fell[0]) > 0
     assert found.losses[-5:].mean() < found.losses[:5].mean()
     report.write(tmp_path, found, title="Adversarial")
     page = (tmp_path / "report.html").read_text("utf-8")
-    assert "Classes: probability" in page and "probability of lamp" in page and "scene as it was" in page
+    assert "Metrics of the loss" in page and "probability of lamp" in page and "scene as it was" in page
     assert "farther from its target" not in page and "NaN" not in page
 
 
 def test_scores_survive_a_checkpoint(stand_in, tmp_path):
-    half = fitting.Run(posed(), out=tmp_path)
+    half = fitting.Fit(posed(), out=tmp_path)
     for _ in range(7):
         half.step()
-    half._save()
-    resumed = fitting.Run(posed(), out=tmp_path, resume=True)
+    half.save(tmp_path / "checkpoint.npz")
+    resumed = fitting.Fit(posed(), out=tmp_path, resume=True)
     assert resumed.progress.scores == half.progress.scores
-    found = resumed.finish(progress=False)
+    found = resumed.run(progress=False)
     assert all(len(p) == 20 for p in found.scores.values())
 
 
 def test_scores_are_means_of_the_tasks(stand_in):
-    run = fitting.Run(posed(parts=3))
+    run = fitting.Fit(posed(parts=3))
     seen = []
 
     def executor(values, tasks):
@@ -175,8 +172,10 @@ def test_scores_are_means_of_the_tasks(stand_in):
 
     run.executor = executor
     run.step()
-    assert len(seen) == 3 and len({g.scores["lamp"] for g in seen}) == 3
-    assert run.progress.scores["lamp"] == [pytest.approx(np.mean([g.scores["lamp"] for g in seen]))]
+    assert len(seen) == 3 and len({g.scores["probability of lamp"] for g in seen}) == 3
+    assert run.progress.scores["probability of lamp"] == [
+        pytest.approx(np.mean([g.scores["probability of lamp"] for g in seen]))
+    ]
 
 
 # ------------------------------------------------------------------ refusals
@@ -211,7 +210,7 @@ def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     classifier.network.cache_clear()
     with pytest.raises(ValueError, match=r"^fit: [^\n]*pip install 'rimlight\[adversarial\]'$"):
-        fitting.Run(posed())
+        fitting.Fit(posed())
 
 
 def test_pictures_of_one_channel_are_refused(stand_in, tmp_path):
@@ -222,7 +221,7 @@ def test_pictures_of_one_channel_are_refused(stand_in, tmp_path):
     file.write_text(text.replace('<film type="hdrfilm">', grey), "utf-8")
     free = (Free(key=("cube.vertex_positions",), kind="pose"),)
     with pytest.raises(ValueError, match=r"target\.0: the classifier wants 3 channels, the film has 1"):
-        fitting.Run(dataclasses.replace(posed(), scene=file, free=free))
+        fitting.Fit(dataclasses.replace(posed(), scene=file, free=free))
 
 
 # ------------------------------------------------------------------ the stop sign
@@ -257,7 +256,7 @@ def test_the_sign_has_2208_free_numbers(sign):
 def test_the_sign_is_seen_and_moves(stand_in, sign):
     """One step at a low resolution: all that is free has a gradient."""
     read = dataclasses.replace(inverse.read(sign), stage=(Stage(iterations=1, resolution=56),), target=(Target(spp=4),))
-    run = fitting.Run(read)
+    run = fitting.Fit(read)
     run.step()
     assert not run.silent() and not run.progress.skipped
 
@@ -274,7 +273,7 @@ def test_the_sign_is_attacked(true_network, sign):
     read = inverse.read(sign)
     read = dataclasses.replace(read, stage=(Stage(iterations=12, rate=4),), target=(Target(spp=4),))
     scores = fitting.fit(read, progress=False).scores
-    odds = scores["traffic light"] / scores["street sign"]
+    odds = scores["probability of traffic light"] / scores["probability of street sign"]
     print(odds)
     assert odds[-1] > 20 * odds[0]
 

@@ -12,7 +12,8 @@ import pytest
 from PIL import Image
 
 from rimlight.inverse import free_parameters, losses, renderer
-from rimlight.inverse.fitting import Run
+from rimlight.inverse import result as results
+from rimlight.inverse.fitting import Fit
 from rimlight.inverse.optimisers import inner_product
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
 from rimlight.inverse.renderer import Renderer, Task
@@ -127,15 +128,17 @@ def test_derivative_image_is_that_on_the_way(room):
         Free(key=("left.to_world",), kind="pose", start=(0.1, 0.1, 0, 0, 0, 0)),
         Free(key=(FLOOR,), kind="material", start=(0.3, 0.4, 0.5)),
     )
-    run = Run(problem(room, *free, target=(Target(spp=16),)))
+    run = Fit(problem(room, *free, target=(Target(spp=16),)))
     result, step = {name: truth for p in run.parameters for name, truth in p.truth.items()}, 0.05
 
     def image(t: float, seed: int) -> np.ndarray:
         at = {name: x + np.float32(t) * (x - run.start[name]) for name, x in result.items()}
-        return run.renderer.image(run._values(at), Task(0, None, 4096, seed)).astype(np.float64)
+        return run.renderer.image(run.values(at), Task(0, None, 4096, seed)).astype(np.float64)
 
-    seeds, at = range(4), run._values(result)
-    found = np.mean([run.renderer.derivative(at, run._way(result), Task(0, None, 1024, seed)) for seed in seeds], 0)
+    seeds, at = range(4), run.values(result)
+    found = np.mean(
+        [run.renderer.derivative(at, results._way(run, result), Task(0, None, 1024, seed)) for seed in seeds], 0
+    )
     expected = np.mean([image(step, 9 + seed) - image(-step, 9 + seed) for seed in seeds], 0) / (2 * step)
     print(np.abs(found - expected).sum() / np.abs(expected).sum())
     assert np.abs(found - expected).sum() < 0.04 * np.abs(expected).sum()
@@ -287,7 +290,7 @@ def test_films_and_pictures_of_other_channels(room, tmp_path, pixels, channels):
     assert found.image.shape == (24, 24, 1 if pixels.startswith("luminance") else 3)
     assert tested.views[0]._truth().shape == found.image.shape
     target = np.full_like(found.image, ((0.5 + 0.055) / 1.055) ** 2.4)
-    expected, _ = losses.value_and_gradient(posed.loss, found.image, target, np.ones((24, 24)))
+    expected, _, _ = losses.function(posed.loss)(found.image, target, np.ones((24, 24)))
     assert found.loss == pytest.approx(expected, rel=0.02)  # the picture has 8 bits
     assert found.gradients[FLOOR].any()
 
@@ -307,9 +310,9 @@ def test_a_resolution_at_which_no_pixel_counts_is_refused_at_once(room, tmp_path
     Image.fromarray(stripes).save(tmp_path / "mask.png")
     Image.fromarray(np.full((24, 24, 3), 128, np.uint8)).save(tmp_path / "target.png")
     target = Target(file=tmp_path / "target.png", mask=tmp_path / "mask.png")
-    Run(problem(room, target=(target,), stage=(Stage(), Stage(resolution=12))))
+    Fit(problem(room, target=(target,), stage=(Stage(), Stage(resolution=12))))
     with pytest.raises(ValueError, match=r"target\.0: no pixel counts at 6 x 6"):
-        Run(problem(room, target=(target,), stage=(Stage(), Stage(resolution=6))))
+        Fit(problem(room, target=(target,), stage=(Stage(), Stage(resolution=6))))
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,12 @@ import errno
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
+import types
 import zipfile
 from pathlib import Path
 
@@ -19,10 +21,11 @@ import pytest
 
 from rimlight import inverse, scenes
 from rimlight.cli import main
-from rimlight.inverse import checkpoint, executors, fitting
+from rimlight.inverse import checkpoint, executors, fitting, progress, report
 from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Starts, Target
-from rimlight.inverse.renderer import Renderer, Task
+from rimlight.inverse.renderer import Gradient, Renderer, Task
+from rimlight.inverse.result import Result
 
 GREEN, RED, COLOUR = "green.vertex_positions", "red.vertex_positions", "green.bsdf.reflectance.value"
 SHAPE = Free(key=(GREEN,), kind="shape", move="xy", rate=0.05, start=(0.2, -0.1, 0))
@@ -35,7 +38,7 @@ def triangles(*free: Free, steps: int = 6, **options) -> Problem:
     return Problem(scene=scenes.path("two_triangles"), free=free or (SHAPE,), **options)
 
 
-def fit(problem: Problem, **options) -> fitting.Fit:
+def fit(problem: Problem, **options) -> Result:
     return inverse.fit(problem, progress=False, **options)
 
 
@@ -64,13 +67,13 @@ from rimlight import inverse
 import drjit as dr
 import numpy as np
 from rimlight import exr
-from rimlight.inverse import checkpoint, fitting, problem
+from rimlight.inverse import checkpoint, fitting, problem, progress
 
 dr.set_thread_count(1)
-fitting.INTERVAL = 0
+fitting.INTERVAL, progress.SHARE = 0, float("inf")  # a checkpoint after each step
 
 folder, start, end, last = sys.argv[1:]
-run = fitting.Run(problem.read("fit.toml"), out=folder, resume=start == "resume")
+run = fitting.Fit(problem.read("fit.toml"), out=folder, resume=start == "resume")
 print(run.progress.step, flush=True)
 
 def executor(values, tasks):
@@ -84,10 +87,9 @@ def executor(values, tasks):
     return [run.renderer.gradient(values, task) for task in tasks]
 
 run.executor = executor
-found = run.finish(progress=False)
+found = run.run(progress=False)
 errors = {label.replace("/", " "): e for label, e in found.errors.items()}
-frames = np.array([step for step, _ in found.frames])
-np.savez(folder + ".npz", losses=found.losses, segments=found.segments, frames=frames, **found.values, **errors)
+np.savez(folder + ".npz", losses=found.losses, segments=found.segments, **found.values, **errors)
 """
 
 
@@ -208,20 +210,61 @@ def test_there_must_be_a_checkpoint(tmp_path):
         fit(triangles(), resume=True)
 
 
-def test_a_full_disk_is_said_once(tmp_path, monkeypatch, caplog):
-    def full(*_):
+def test_a_full_disk_stops_the_fit(tmp_path, monkeypatch):
+    """At the first checkpoint that cannot be written; the last good one is kept, and goes on later."""
+
+    def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(fitting, "INTERVAL", 0)
-    run = fitting.Run(triangles(), out=tmp_path)
+    monkeypatch.setattr(progress, "SHARE", float("inf"))  # a checkpoint after each step
+    run = fitting.Fit(triangles(), out=tmp_path)
+    steps = iter(run)
+    next(steps), next(steps)
     first = (tmp_path / "checkpoint.npz").read_bytes()
-    monkeypatch.setattr(checkpoint, "save", full)
-    with caplog.at_level(logging.WARNING, logger=fitting.__name__):
-        found = run.finish(progress=False)
-    assert found.status == "finished" and len(found.losses) == 6 and len(found.views) == 1
-    (record,) = caplog.records
-    assert "No space left on device" in record.getMessage()
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.np.lib.format, "write_array", full)
+        found = run.run(progress=False)
+    assert len(found.losses) == 3 and len(found.views) == 1
+    assert re.fullmatch(
+        r"stopped: cannot write .*checkpoint\.npz: No space left on device \([\d.e+]+ MB are free there\)", found.status
+    )
     assert (tmp_path / "checkpoint.npz").read_bytes() == first
+    assert fit(triangles(), out=tmp_path, resume=True).status == "finished"
+
+
+def test_checkpoints_take_a_twentieth_of_the_time(tmp_path, monkeypatch):
+    """With a clock of our own: a step takes 1 s, and a checkpoint 2 s, which every 5 s would be too much."""
+    now, written = [0.0], []
+    monkeypatch.setattr(fitting, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    run = fitting.Fit(triangles(MATERIAL, steps=100), out=tmp_path)
+
+    def executor(values, tasks):
+        now[0] += 1
+        return [Gradient(1.0, {COLOUR: np.zeros(3, np.float32)}, np.zeros((16, 16, 3), np.float32)) for _ in tasks]
+
+    def save(file):
+        now[0] += 2
+        written.append(run.progress.step)
+
+    run.executor, run.save = executor, save
+    assert len(list(run)) == 100
+    assert written[0] == 6 and written[1] - written[0] == 41  # the first one tells what they cost
+    assert written[-1] == 100 and 2 * (len(written) - 1) <= 0.05 * 100 + 2
+
+
+def test_a_report_is_written_with_what_fits(tmp_path, monkeypatch):
+    """What cannot be written is named, and keeps nothing else from being written."""
+
+    def full(path, *_):
+        raise OSError(f"cannot write {path}: No space left on device")
+
+    found = fit(triangles(steps=1))
+    monkeypatch.setattr(report, "write_exr", full)
+    with pytest.raises(OSError, match=r"start_0\.exr: No space left on device, and 2 other files; .* MB are free"):
+        inverse.write(tmp_path, found, title="Full")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names >= {"report.html", "result.json", "result.npz", "problem.toml", "result_0.png", "target_0.png"}
 
 
 # ------------------------------------------------------------------ other processes
@@ -234,11 +277,11 @@ def shared() -> Problem:
 
 
 @pytest.fixture(scope="module")
-def alone() -> fitting.Fit:
+def alone() -> Result:
     return fit(shared())
 
 
-def assert_same(found: fitting.Fit, alone: fitting.Fit) -> None:
+def assert_same(found: Result, alone: Result) -> None:
     assert found.status == "finished"
     np.testing.assert_allclose(found.losses, alone.losses, rtol=1e-6 / alone.losses.max())
     for key, value in alone.values.items():

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 
 from rimlight import inverse, scenes
-from rimlight.inverse import fitting
+from rimlight.inverse import fitting, result
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
 from rimlight.inverse.renderer import Gradient
+from rimlight.inverse.result import Result
 
 pytestmark = pytest.mark.usefixtures("no_derivative_image")
 
@@ -34,7 +35,7 @@ def triangles(*free: Free, steps: int = 12, **options) -> Problem:
     return Problem(scene=scenes.path("two_triangles"), free=free or (SHAPE,), **options)
 
 
-def fit(problem: Problem, **options) -> fitting.Fit:
+def fit(problem: Problem, **options) -> Result:
     return inverse.fit(problem, progress=False, **options)
 
 
@@ -54,7 +55,7 @@ class Valley:
         return [Gradient(float(loss), {COLOUR: np.float32(gradient)}, image) for _ in tasks]
 
 
-def error_of(found: fitting.Fit, label: str) -> np.ndarray:
+def error_of(found: Result, label: str) -> np.ndarray:
     (errors,) = (errors for name, errors in found.errors.items() if label in name)
     return errors
 
@@ -78,7 +79,7 @@ def test_a_fit_converges(capfd):
     np.testing.assert_array_equal(found.values[GREEN].reshape(-1, 3)[:, 2], 0)
     steps = [step for step, _ in found.frames]
     assert steps[0] == 0 and steps[-1] == 60 and steps == sorted(set(steps)) and len(steps) <= fitting.FRAMES + 1
-    assert json.loads(fitting.summary(found))["steps"] == 60
+    assert json.loads(result.summary(found))["steps"] == 60
     assert capfd.readouterr().err == ""  # no bar
 
 
@@ -87,14 +88,14 @@ def test_stages_have_resolutions_and_rates():
     posed = triangles(
         stage=(Stage(iterations=5, resolution=8, rate=2), Stage(iterations=4, spp=2, rate=0.5, decay=0.01))
     )
-    run = fitting.Run(posed)
+    run = fitting.Fit(posed)
 
     def executor(values, tasks):
         seen.append((tasks[0].width, tasks[0].spp, tasks[0].seed, values[GREEN].copy()))
         return [run.renderer.gradient(values, task) for task in tasks]
 
     run.executor = executor
-    found = run.finish(progress=False)
+    found = run.run(progress=False)
     assert [s[:2] for s in seen] == 5 * [(8, 4)] + 4 * [(None, 2)]
     assert len({s[2] for s in seen}) == 9
     moved = [np.abs(b[3] - a[3]).max() for a, b in itertools.pairwise(seen)]
@@ -105,8 +106,8 @@ def test_stages_have_resolutions_and_rates():
 
 
 def test_the_scene_is_left_at_the_result():
-    run = fitting.Run(triangles(SHAPE, dataclasses.replace(MATERIAL, start=(0.2,))))
-    found = run.finish(progress=False)
+    run = fitting.Fit(triangles(SHAPE, dataclasses.replace(MATERIAL, start=(0.2,))))
+    found = run.run(progress=False)
     params = mi.traverse(run.renderer.views[0].scene)
     np.testing.assert_array_equal(np.array(params[GREEN]), found.values[GREEN])
     np.testing.assert_array_equal(np.array(params[COLOUR]).ravel(), found.values[COLOUR])
@@ -209,7 +210,7 @@ def test_gradients_that_are_not_finite_are_left_out(broken):
     assert [i for i in range(1, 12) if np.array_equal(executor.seen[i - 1], executor.seen[i])] == [4, 7, 8]
     assert np.isfinite(found.values[COLOUR]).all()
     gives_up = fit(triangles(MATERIAL, steps=40, max_bad=3), executor=Valley({i: broken for i in range(15, 40)}))
-    assert gives_up.status == "gave up: 3 gradients in a row were not finite"
+    assert gives_up.status == "gave up: 3 steps in a row led to numbers that are not finite"
     assert len(gives_up.losses) == 17 and gives_up.skipped == 3
     assert np.isfinite(gives_up.values[COLOUR]).all()
 

@@ -16,14 +16,15 @@ from PIL import Image
 
 from rimlight import scenes
 from rimlight.exr import read_exr
-from rimlight.inverse import fitting, page, problem, report
+from rimlight.inverse import animation, fitting, page, problem, report, result
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
+from rimlight.inverse.result import Result
 
 NASTY = '<script>alert("a&b")</script> \'$x^$'
 
 
 @pytest.fixture(scope="module")
-def fit() -> fitting.Fit:
+def fit() -> Result:
     free = lambda name, start: Free(
         key=(f"{name}.vertex_positions",), kind="shape", move="xy", rate=0.05, start=(*start, 0.0)
     )
@@ -46,7 +47,7 @@ def folder(fit, tmp_path_factory) -> Path:
     return path
 
 
-def written(path: Path, fit: fitting.Fit, **options) -> Page:
+def written(path: Path, fit: Result, **options) -> Page:
     report.write_report(path, fit, **{"title": "A fit", **options})
     return Page(path.read_text("utf-8"))
 
@@ -126,7 +127,7 @@ def test_odd_fits_can_be_shown(fit, tmp_path):
     view = fit.views[0]
     grey = [image[:20, :, :1] for image in (view.start * np.nan, view.result, view.target)]
     wide = [np.tile(image, (1, 40, 1)) for image in (view.start, view.result, view.target)]
-    views = [view, *(fitting.ViewOfFit(*images, images[0][..., 0] * 0) for images in (grey, wide))]
+    views = [view, *(result.ViewOfFit(*images, images[0][..., 0] * 0) for images in (grey, wide))]
     many = np.linspace(0, 1, 300, dtype=np.float32)
     odd = dataclasses.replace(
         fit,
@@ -141,7 +142,7 @@ def test_odd_fits_can_be_shown(fit, tmp_path):
         problem=dataclasses.replace(fit.problem, starts=Starts(count=2, value=0.1)),
     )
     shown = written(tmp_path / "a.html", odd)
-    assert all(image.width <= max(page.WIDEST, 2 * report.LARGEST) for image in shown.images())
+    assert all(image.width <= max(page.WIDEST, 2 * animation.LARGEST) for image in shown.images())
     for part in ("View 2", "not finite", "180.00", "1.000 × 10⁻⁶", "300 numbers, mean 0.5000", "start 2", "of 13"):
         assert part in shown.text
     assert "body.turn (degrees)" in shown.text
@@ -189,21 +190,21 @@ def test_files_read_back(folder, fit):
 
 
 def test_animation_as_gif(fit, tmp_path, monkeypatch):
-    monkeypatch.setattr(report.shutil, "which", lambda name: None)
-    path = report.write_animation(tmp_path, fit)
+    monkeypatch.setattr(animation.shutil, "which", lambda name: None)
+    path = animation.write_animation(tmp_path, fit)
     assert path == tmp_path / "convergence.gif"
     with Image.open(path) as image:
         assert image.n_frames == len(fit.frames)
         assert image.info["loop"] == 0
-        assert min(image.size) >= report.ENLARGED
+        assert min(image.size) >= animation.ENLARGED
         shown = []
         for i in range(image.n_frames):
             image.seek(i)
             shown.append(np.asarray(image.convert("RGB"), np.int32))
     moved = lambda a, b: np.abs(a - b)[:, : a.shape[1] // 2].mean()
     assert moved(shown[0], shown[-1]) > 1
-    monkeypatch.setattr(report, "MOST", 1)  # bytes
-    path = report.write_animation(tmp_path, dataclasses.replace(fit, frames=[*fit.frames, *fit.frames]))
+    monkeypatch.setattr(animation, "MOST", 1)  # bytes
+    path = animation.write_animation(tmp_path, dataclasses.replace(fit, frames=[*fit.frames, *fit.frames]))
     with Image.open(path) as image:
         assert image.n_frames < 8
 
@@ -211,7 +212,7 @@ def test_animation_as_gif(fit, tmp_path, monkeypatch):
 def test_animation_as_video(fit, tmp_path):
     if shutil.which("ffmpeg") is None:
         pytest.skip("needs ffmpeg")
-    path = report.write_animation(tmp_path, fit)
+    path = animation.write_animation(tmp_path, fit)
     if path.suffix == ".gif":
         pytest.skip("ffmpeg has no encoder for H.264")
     assert path.read_bytes()[4:8] == b"ftyp"
@@ -227,7 +228,7 @@ def test_broken_ffmpeg_gives_a_gif(fit, tmp_path, monkeypatch, program):
     (tmp_path / "bin" / "ffmpeg").write_text(program)
     (tmp_path / "bin" / "ffmpeg").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-    assert report.write_animation(tmp_path / "out", fit) == tmp_path / "out" / "convergence.gif"
+    assert animation.write_animation(tmp_path / "out", fit) == tmp_path / "out" / "convergence.gif"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["convergence.gif"]
 
 

@@ -217,6 +217,7 @@ def test_packages_are_imported_by_their_name(root: Path, folder: str) -> None:
 
 #: What each room may import: itself, and those before it.
 ROOMS = (
+    "rimlight.edge_sampling.refusals",
     "rimlight.edge_sampling.rays",
     "rimlight.edge_sampling.geometry",
     "rimlight.edge_sampling.projection",
