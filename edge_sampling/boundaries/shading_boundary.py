@@ -258,11 +258,7 @@ class ShadingBoundary:
             ray, pi, y, hidden, own = look(side, active)
             past = outward != 0
             active &= ~hidden & (past | own)
-            L = mi.Spectrum(0)
-            if self.emission:
-                L += self._emitted(
-                    tracer, point, y, ω, pdf, distance, active & past & emission, light, ~outline.is_line
-                )
+            L = self._emitted(scene, point, y, ω, pdf, distance, active & past & emission, light, ~outline.is_line)
             valid = active & y.is_valid()
             if tracer.scatters(2):
                 again = sampler.clone()
@@ -308,12 +304,13 @@ class ShadingBoundary:
         return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, 2 * n_dl, n_dl)
 
     def _emitted(
-        self, tracer, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
+        self, scene, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
     ) -> mi.Spectrum:
         """Light that one light emits at y towards a point. pdf : density of ω among samples of the BSDF there.
         distance : of the edge. found_too : may the edge throw a shadow that is found from the light?"""
-        scene, si = tracer.scene, point.si
-        at_first = point.depth == 1
+        if not self.emission:
+            return mi.Spectrum(0)
+        si, at_first = point.si, point.depth == 1
         emitter = y.emitter(scene, active)
         lit = active & (emitter == light)
         L = emitter.eval(y, lit)
