@@ -105,7 +105,7 @@ class Fit:
             raise InputError("fit: to write a log for TensorBoard, name a folder")
         with alone(self.problem.variant):
             self._prepare(executor)
-            if tensorboard:
+            if tensorboard and self.file is not None:
                 self._callbacks.append(TensorBoard(self.file.parent))
             if resume:
                 if self.file is None:
@@ -141,7 +141,8 @@ class Fit:
         self.progress = Progress()
         self.before: np.ndarray | None = None
         self.image: np.ndarray | None = None
-        self._began, self._before = None, 0.0
+        self._began: float | None = None
+        self._before = 0.0
         self._saved, self._cost = 0.0, 0.0  # when the last checkpoint was written, and how long that took, seconds
 
     # ---------------------- The loop ----------------------
@@ -184,7 +185,7 @@ class Fit:
         with alone(self.problem.variant):
             step = self._step()
         now = self.progress
-        now.seconds = self._before + time.monotonic() - self._began
+        now.seconds = self._seconds()
         now.times.append(now.seconds)
         for callback in self._callbacks:
             callback(step)
@@ -199,6 +200,10 @@ class Fit:
         """End the fit after the present step. It keeps the best state so far. status : why."""
         if self.status == "running":
             self.status = status
+
+    def _seconds(self) -> float:
+        """How long the fit has run, its former runs included."""
+        return self._before + (0 if self._began is None else time.monotonic() - self._began)
 
     def _clock_starts(self) -> None:
         if self._began is None:
@@ -227,7 +232,7 @@ class Fit:
         ]
         found = self.executor(values, tasks)
         loss = float(np.mean([f.loss for f in found]))
-        gradients = {
+        gradients: dict[str, Any] = {
             key: sum((f.gradients[key] for f in found if key in f.gradients), np.float32(0)) / len(found)
             for key in values
         }

@@ -75,7 +75,9 @@ class Pointwise:
         """By what a difference is multiplied."""
         return 1.0
 
-    def __call__(self, image, target, weight):
+    def __call__(
+        self, image: np.ndarray, target: np.ndarray, weight: np.ndarray
+    ) -> tuple[float, np.ndarray, dict[str, float]]:
         image, target, weight = (np.asarray(a, np.float64) for a in (image, target, weight))
         s = self.s(target)
         difference = (image - target) * s
@@ -106,7 +108,7 @@ class L1(Pointwise):
 
     label = "mean absolute difference (radiance)"
 
-    def ρ(self, x):
+    def ρ(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.abs(x), np.sign(x)
 
 
@@ -115,7 +117,7 @@ class L2(Pointwise):
 
     label = "mean squared difference (radiance²)"
 
-    def ρ(self, x):
+    def ρ(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.square(x), 2 * x
 
 
@@ -124,7 +126,7 @@ class Relative(L2):
 
     label = "mean squared relative difference"
 
-    def s(self, target):
+    def s(self, target: np.ndarray) -> np.ndarray:
         return 1 / np.sqrt(np.square(target) + FLOOR)
 
 
@@ -247,7 +249,7 @@ def drjit_loss(function: Callable[[Any, Any, Any], Any], label: str = "") -> Los
         dr.backward(value)
         return float(np.array(dr.detach(value)).item()), np.array(dr.grad(seen)).reshape(image.shape), metrics
 
-    loss.label = label or getattr(function, "__name__", "loss")
+    loss.label = label or getattr(function, "__name__", "loss")  # type: ignore[attr-defined]
     return loss
 
 

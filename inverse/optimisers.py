@@ -68,7 +68,7 @@ class Optimiser:
         found = {name: g * self.masks[name] if name in self.masks else g for name, g in found.items()}
         dr.eval(found)
         if self.clip is not None:
-            found = {name: self._clipped(name, np.array(gradient)) for name, gradient in found.items()}
+            found = {name: self._clipped(name, np.array(gradient), self.clip) for name, gradient in found.items()}
         before = self.latents()
         self.rule.step(found, {name: rate * factor for name, rate in self.rates.items()})
         self._latents = None
@@ -82,9 +82,9 @@ class Optimiser:
                 self.latents()[name] = legal
         return True
 
-    def _clipped(self, name: str, gradient: np.ndarray) -> mi.Float:
+    def _clipped(self, name: str, gradient: np.ndarray, clip: float) -> mi.Float:
         length, known = float(np.linalg.norm(gradient)), self.lengths[name]
-        longest = self.clip * float(np.median(known)) if known else length
+        longest = clip * float(np.median(known)) if known else length
         known.append(length)
         del known[:-REMEMBERED]
         return mi.Float(gradient * (min(1, longest / length) if length > 0 else 1))
@@ -164,7 +164,8 @@ class OfPair:
     """An object with the methods `init` and `update`."""
 
     def __init__(self, pair: Any, start: Mapping[str, np.ndarray]):
-        self.pair, self.held = pair, {}
+        self.pair = pair
+        self.held: dict[str, Any] = {}
         for name, latent in start.items():
             self.put(name, latent)
         self.reset()
@@ -261,7 +262,8 @@ def _leaves(tree: Any) -> Iterator[Any]:
 def _rebuilt(tree: Any, leaves: Iterator[np.ndarray]) -> Any:
     """A tree as this one, of other numbers."""
     if isinstance(tree, Mapping):
-        return type(tree)((key, _rebuilt(tree[key], leaves)) for key in sorted(tree))
+        numbers = ((key, _rebuilt(tree[key], leaves)) for key in sorted(tree))
+        return type(tree)(numbers)  # type: ignore[call-arg]
     if isinstance(tree, tuple | list):
         parts = [_rebuilt(part, leaves) for part in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -275,7 +275,7 @@ def check(problem: Problem) -> None:
             raise InputError(f"fit: {where}lower must be below upper, got {low} and {high}")
 
 
-def _at_least(where: str, of: Any, minima: dict[str, float]) -> None:
+def _at_least(where: str, of: Any, minima: Mapping[str, float]) -> None:
     for name, minimum in minima.items():
         value = getattr(of, name)
         if value is not None and not value >= minimum:

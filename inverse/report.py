@@ -9,6 +9,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -63,8 +64,8 @@ def write(folder: Path, result: Result, *, title: str) -> None:
     for i, view in enumerate(result.views):
         for name, image in (("start", view.start), ("result", view.result), ("target", view.target)):
             path = folder / f"{name}_{i}"
-            attempt(lambda path=path, image=image: write_exr(path.with_suffix(".exr"), {"": image}))
-            attempt(lambda path=path, image=image: pictures.write_image(path.with_suffix(".png"), image))
+            attempt(partial(write_exr, path.with_suffix(".exr"), {"": image}))
+            attempt(partial(pictures.write_image, path.with_suffix(".png"), image))
     if failed:
         more = f", and {len(failed) - 1} other files" if len(failed) > 1 else ""
         free = shutil.disk_usage(folder).free / 1e6
@@ -78,7 +79,7 @@ def _write_text(path: Path, text: str) -> None:
 
 def _write_values(path: Path, values: Mapping[str, np.ndarray]) -> None:
     with replacing(path) as temporary:
-        np.savez(temporary, **values)
+        np.savez(temporary, **values)  # type: ignore[arg-type]
 
 
 def live(result: Result, *, title: str) -> str:
@@ -209,8 +210,8 @@ def _parameters(result: Result) -> str:
     sections = ['<section>\n<h2>Parameters</h2>\n<div class="row">']
     if result.errors:
         ratio = lambda e: number(e[-1] / e[0], 2) if e[0] else "–"
-        rows = [(label, number(e[0]), number(e[-1]), ratio(e)) for label, e in result.errors.items()]
-        shown = page.table(("error", "start", "result", "ratio"), rows, "Distance from the truth")
+        errors = [(label, number(e[0]), number(e[-1]), ratio(e)) for label, e in result.errors.items()]
+        shown = page.table(("error", "start", "result", "ratio"), errors, "Distance from the truth")
         sections.append(f"<div>\n<h3>Distance from the truth</h3>\n{shown}\n</div>")
     rows = [(_latent_name(result, name), *_numbers(result, name)) for name in result.latents]
     shown = page.table(("parameter", "start", "result"), rows, "Values of the parameters")
