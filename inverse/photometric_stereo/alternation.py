@@ -42,11 +42,17 @@ class State:
     kind: Kind
     left_out: float = np.nan
     uncertain: float = 0.0
+    halves: float = np.nan
     start: bool = False
 
     def better_than(self, other: State | None) -> bool:
         """Where nothing can be left out, what is newer is."""
         return other is None or not self.left_out >= other.left_out
+
+    def beats(self, start: State) -> bool:
+        """Does it predict better than the start, and do its normals depend less on which lights tell them? Where
+        nothing can be left out, it does."""
+        return not (self.left_out >= start.left_out or self.halves >= start.halves)
 
     def needed_beside(self, simpler: State) -> bool:
         """Does it predict better by more than the standard error of what is simpler? (The rule of one standard error,
@@ -150,8 +156,10 @@ class Alternations:
 
     def score(self, state: State, view: View) -> None:
         if self.judge.able:
-            errors = self.judge.errors(state.guess, self.kind, view.points, view.seen, view.indirect)
+            of_view = view.points, view.seen, view.indirect
+            errors = self.judge.errors(state.guess, self.kind, *of_view)
             state.left_out, state.uncertain = float(errors.mean()), float(errors.std() / np.sqrt(len(errors)))
+            state.halves = _mean(self.judge.disagreement(state.guess, *of_view))
 
     def run(self, course: Course, record: Callable[[float], None], view: View | None = None) -> State:
         """Go on with alternations to their end, and return the best state.
@@ -201,9 +209,11 @@ class Alternations:
             guess.exposures[np.abs(np.log(guess.exposures)) < STATED] = 1
         return float(np.sqrt(residual) / model.scale)
 
-    def judged_start(self, guess: Guess, lights: np.ndarray, kinds: tuple[Kind, ...]) -> tuple[State, View | None]:
+    def judged_start(
+        self, guess: Guess, lights: tuple[np.ndarray, np.ndarray], kinds: tuple[Kind, ...]
+    ) -> tuple[State, View | None]:
         """The start, with its normals held, as its best material of these kinds predicts what was left out; and its
-        view, if anything was."""
+        view, if anything was. lights : as of `Judge.errors`."""
         depth = self.integrate(guess)
         state, view = State(guess, depth, Kind(), start=True), None
         if self.judge.able:
@@ -212,7 +222,14 @@ class Alternations:
             state.left_out = min(
                 float(self.judge.errors(guess, kind, *of_view, lights=lights).mean()) for kind in kinds
             )
+            state.halves = _mean(self.judge.disagreement(guess, *of_view, lights=lights))
         return state, view
+
+
+def _mean(angles: np.ndarray) -> float:
+    """Of those that are known; NaN if none is."""
+    known = angles[np.isfinite(angles)]
+    return float(known.mean()) if known.size else np.nan
 
 
 def _smooth(pixels: np.ndarray, mask: np.ndarray, width: float) -> None:

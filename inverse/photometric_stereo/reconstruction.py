@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from rimlight import ggx
 
-from . import least_squares, start
+from . import least_squares, start, taking_back
 from .alternation import Alternations, Course, State, View
 from .dataset import Dataset, angles
 from .direct import Guess
@@ -116,7 +116,9 @@ class Result:
     """normals : (P, 3). depth : (Q,), of the pixels of `domain`. weights : (B, 3), with `scale` the BSDF of the images.
     kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and so was kept;
     "judged", if something else predicts better; "not judged", with too few lights to leave any out. left_out : how far
-    predictions of "start" and "result" are off, in the mean value of each pixel.
+    predictions of "start" and "result" are off, in the mean value of each pixel. halves : of both, the mean angle
+    between normals of one half of the lights and of the other, degrees. taken_back : part of the surface whose normals
+    are those of the start.
     history : for each alternation, the size of the images, seconds since the start, the root mean square residual over
     the median value, and where the truth is known the mean angular error, degrees."""
 
@@ -130,6 +132,8 @@ class Result:
     kind: Kind
     verdict: str = "not judged"
     left_out: dict[str, float] = field(default_factory=dict)
+    halves: dict[str, float] = field(default_factory=dict)
+    taken_back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -242,13 +246,26 @@ class Reconstruction:
             elif now.course is None:
                 now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=np.nan), most)
             now.end_trial(self.work.run(now.course, self._record, view))
+        if now.level == len(options.resolutions) - 1:
+            self._take_back()
         return self._result()
+
+    def _take_back(self) -> None:
+        """To the start, what of the best state depends more on which lights tell it."""
+        now, best = self.now, self.now.best_so_far()
+        if best.start or not self.work.judge.able:
+            return
+        if self.work.kind != best.kind:
+            work, self.work = self.work, None
+            self.work = Alternations(work.data, self.lobes, best.kind, work.judge, self.options, self.rng)
+        lights = start.flat(self.work.data).lighting()
+        now.best, now.back = taking_back.taken_back(self.work, best, now.start, lights)
 
     def _begin(self, most: int, coarse: Result | None) -> View | None:
         """Judge the start of a size, and begin its alternations. Returns the view of their first state, if known."""
         now, options, work = self.now, self.options, self.work
         guess = start.guess(work.data, self.lobes, work.judge.counts, options)
-        now.start, view = work.judged_start(guess, start.flat(work.data).lighting()[0], self.kinds)
+        now.start, view = work.judged_start(guess, start.flat(work.data).lighting(), self.kinds)
         if coarse is None:
             now.first = guess.normals
             now.course = Course(copy.deepcopy(now.start), most)
@@ -292,6 +309,8 @@ class Reconstruction:
             best.kind,
             verdict="start" if best.start else "judged" if work.judge.able else "not judged",
             left_out={"start": now.start.left_out, "result": best.left_out},
+            halves={"start": now.start.halves, "result": best.halves},
+            taken_back=1.0 if best.start else now.back,
             history=now.history,
             seconds=now.seconds,
         )

@@ -53,7 +53,10 @@ def scale(data: Dataset, options: Options) -> float:
     if not options.brightness:
         return 1.0
     directions, irradiance = flat(data).lighting()
-    b = [least_squares.trimmed(_over(data.values[..., c], irradiance), directions) for c in range(3)]
+    b = [
+        least_squares.trimmed(least_squares.as_at_infinity(data.values[..., c], irradiance), directions)
+        for c in range(3)
+    ]
     return options.brightness / np.pi / max(np.median(np.linalg.norm(x, axis=1)) for x in b)
 
 
@@ -64,16 +67,11 @@ def flat(data: Dataset) -> DirectModel:
     return DirectModel(data, ggx.Lobes((np.nan,), (np.nan,)), points=points)
 
 
-def _over(values: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
-    """Values as of lights at infinity, (P, K). 0 where a light does not shine."""
-    return np.divide(values, irradiance, out=np.zeros(values.shape), where=irradiance > 1e-6 * irradiance.max())
-
-
 def guess(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options) -> Guess:
     """Diffuse, with exposures."""
     plane = flat(data)
     directions, irradiance = plane.lighting()
-    values = _over(data.luminance, irradiance)
+    values = least_squares.as_at_infinity(data.luminance, irradiance)
     solve = least_squares.METHODS[options.start]
     if data.clipped.any():  # what is too bright is known then, and need not be guessed
         told = least_squares.telling(counts > 0, directions)[:, None]

@@ -11,14 +11,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from photometric import glossy
 from PIL import Image
 
+from rimlight import ggx
 from rimlight.cli import main
 from rimlight.exr import read_exr, replacing
 from rimlight.inverse import photometric_stereo as ps
-from rimlight.inverse.photometric_stereo import alternation, dataset, least_squares, output, report, simulation
+from rimlight.inverse.photometric_stereo import (
+    alternation,
+    dataset,
+    least_squares,
+    output,
+    report,
+    simulation,
+    start,
+    taking_back,
+)
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
-from rimlight.inverse.photometric_stereo.evidence import Kind
+from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering
 
 N = 24
@@ -86,6 +97,56 @@ def test_the_best_state_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(found.guess.normals, states[1])
     assert found.verdict == "judged"
     assert found.left_out == {"start": 4.0, "result": 1.0}
+
+
+def test_normals_of_halves_tell_a_wrong_model(matte: Dataset) -> None:
+    """Of the right material they agree; of a wrong one they depend on where the lights are."""
+    options = ps.Options(**QUICK)
+    lobes = ggx.read_dictionary()[0]
+    counts = np.ones(matte.values.shape[:2], np.float32)
+    judge = Judge(matte, lobes, left_out(matte, 0), counts, 0, "trimmed")
+    work = alternation.Alternations(matte, lobes, Kind(), judge, options, np.random.default_rng(0))
+    guess = start.guess(matte, lobes, counts, options)
+    guess.weights = glossy(lobes)
+    guess.weights[~np.isnan(lobes.eta)] = 0
+    view = work.view(guess, work.integrate(guess))
+    right = judge.disagreement(guess, view.points, view.seen, None)
+    assert np.nanmean(right) < 1
+    guess.weights = glossy(lobes)
+    assert np.nanmean(judge.disagreement(guess, view.points, view.seen, None)) > 2 * np.nanmean(right)
+    shown = np.zeros_like(view.seen)
+    assert np.isnan(judge.disagreement(guess, view.points, shown, None)).all()
+
+
+def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the halves of the lights say that the start is better, it is kept, and elsewhere the result."""
+    states = []
+    left = np.nonzero(matte.mask)[1] < N / 2
+
+    def disagreement(self, guess, points, seen, indirect, *, lights=None, pixels=None):
+        pixels = self.pixels() if pixels is None else pixels
+        return np.full(len(pixels), 2.0) if lights is not None else np.where(left[pixels], 20.0, 0.1)
+
+    monkeypatch.setattr(taking_back, "WIDTH", 1.0)
+    monkeypatch.setattr(Judge, "disagreement", disagreement)
+    monkeypatch.setattr(alternation.State, "beats", lambda self, start: True)
+    options = ps.Options(**QUICK, reflectance=False)
+    found = ps.reconstruct(matte, options, progress=False, after=lambda r: states.append(r.guess.normals.copy()))
+    columns = np.nonzero(matte.mask)[1]
+    far = columns < N / 2 - 4, columns > N / 2 + 4
+    np.testing.assert_allclose(found.guess.normals[far[0]], found.start[far[0]], atol=0.01)
+    assert min(np.abs(found.guess.normals[far[1]] - n[far[1]]).max() for n in states) < 1e-6
+    assert found.taken_back == pytest.approx(0.5, abs=0.1)
+    assert "of the surface is taken back" in output.judgement(found)[-1]
+
+
+def test_a_result_must_win_in_both() -> None:
+    state = lambda left_out, halves: alternation.State(None, None, Kind(), left_out=left_out, halves=halves)
+    start = state(0.1, 5.0)
+    assert state(0.09, 4.9).beats(start)
+    assert not state(0.09, 5.1).beats(start)
+    assert not state(0.11, 4.0).beats(start)
+    assert state(np.nan, np.nan).beats(state(np.nan, np.nan))
 
 
 def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
