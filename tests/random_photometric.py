@@ -59,6 +59,7 @@ class Row:
     kind: str = ""
     left_out: dict[str, float] = field(default_factory=dict)
     halves: dict[str, float] = field(default_factory=dict)
+    curl: dict[str, float] = field(default_factory=dict)
     taken_back: float = 0.0
     raised: str = ""
     seconds: float = 0.0
@@ -69,11 +70,11 @@ class Row:
 
     def __str__(self) -> str:
         found = self.raised or f"{self.before:6.2f} -> {self.after:6.2f} {self.verdict:6} {self.kind}"
-        off = " ".join(f"{100 * x:.1f}" for x in self.left_out.values())
-        off += ", " + " ".join(f"{x:.1f}" for x in self.halves.values()) + f", {100 * self.taken_back:.0f} % back"
+        shown = lambda pair, factor=1: " ".join(f"{factor * x:.1f}" for x in pair.values())
+        judged = f"{shown(self.left_out, 100)}, {shown(self.halves)}, {shown(self.curl)}, {self.taken_back:.0%} back"
         faults = ", ".join(self.faults)
         mark = "" if self.holds else "  WORSE"
-        return f"{self.seed:5} {found} [{off}] {self.seconds:.0f} s: {self.label}; {faults}{mark}"
+        return f"{self.seed:5} {found} [{judged}] {self.seconds:.0f} s: {self.label}; {faults}{mark}"
 
 
 # ---------------------- Sets ----------------------
@@ -264,7 +265,7 @@ def run(seed: int) -> Row:
             row.before = mean(start.guess(data, lobes, counts, options).normals)
             found = ps.reconstruct(data, options, progress=False)
         row.after, row.verdict = mean(found.guess.normals), found.verdict
-        row.left_out, row.halves, row.taken_back = found.left_out, found.halves, found.taken_back
+        row.left_out, row.halves, row.curl, row.taken_back = found.left_out, found.halves, found.curl, found.taken_back
         row.kind = ("several" if found.kind.several else "one") + (", coat" if found.kind.coat else "")
         if not np.isfinite(found.depth).all():
             row.raised = "depth is not finite"

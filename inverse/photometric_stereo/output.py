@@ -78,6 +78,7 @@ def write_numbers(
         "materials": "one" if guess.base is None else "several",
         "left_out": {name: None if np.isnan(error) else error for name, error in result.left_out.items()},
         "halves": {name: None if np.isnan(angle) else angle for name, angle in result.halves.items()},
+        "curl": {name: None if np.isnan(angle) else angle for name, angle in result.curl.items()},
         "taken_back": result.taken_back,
         "seconds": round(result.seconds, 3),
         "size": [*data.mask.shape[::-1]],
@@ -134,7 +135,7 @@ def judgement(result: Result) -> list[str]:
     if result.verdict == "start":
         return [
             "the start is kept, for nothing predicts values that were left out better and has normals that depend less "
-            f"on which lights tell them: {start} off"
+            f"on which lights tell them and are those of a surface: {start} off"
         ]
     sentences = [f"values that were left out are predicted {found} off, by the start {start}"]
     if np.isfinite(list(result.halves.values())).all():

@@ -117,7 +117,8 @@ class Result:
     kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and so was kept;
     "judged", if something else predicts better; "not judged", with too few lights to leave any out. left_out : how far
     predictions of "start" and "result" are off, in the mean value of each pixel. halves : of both, the mean angle
-    between normals of one half of the lights and of the other, degrees. taken_back : part of the surface whose normals
+    between normals of one half of the lights and of the other, degrees. curl : of both, that between normals and those
+    of the depth that is integrated from them. taken_back : part of the surface whose normals
     are those of the start.
     history : for each alternation, the size of the images, seconds since the start, the root mean square residual over
     the median value, and where the truth is known the mean angular error, degrees."""
@@ -133,6 +134,7 @@ class Result:
     verdict: str = "not judged"
     left_out: dict[str, float] = field(default_factory=dict)
     halves: dict[str, float] = field(default_factory=dict)
+    curl: dict[str, float] = field(default_factory=dict)
     taken_back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -272,7 +274,8 @@ class Reconstruction:
             return None if work.kind.several else view  # of several, the guess is another one
         sides = [round(1 / options.resolutions[i]) for i in (now.level - 1, now.level)]
         guess = start.refined(coarse.guess, coarse.domain, work.data, before=sides[0], now=sides[1])
-        now.course = Course(State(guess, work.integrate(guess), work.kind), most)
+        # Never the best, for it was not fitted to these images, though what is fitted to it may predict well
+        now.course = Course(State(guess, work.integrate(guess), work.kind, left_out=np.inf), most)
         return None
 
     def _record(self, residual: float) -> None:
@@ -310,6 +313,7 @@ class Reconstruction:
             verdict="start" if best.start else "judged" if work.judge.able else "not judged",
             left_out={"start": now.start.left_out, "result": best.left_out},
             halves={"start": now.start.halves, "result": best.halves},
+            curl={"start": now.start.curl, "result": best.curl},
             taken_back=1.0 if best.start else now.back,
             history=now.history,
             seconds=now.seconds,

@@ -14,7 +14,7 @@ from rimlight import ggx
 from . import calibration, least_squares
 from .dataset import Dataset, unit
 from .direct import DirectModel, Guess
-from .rendering import Domain
+from .rendering import Domain, unlit
 
 if TYPE_CHECKING:
     from .reconstruction import Options
@@ -41,6 +41,11 @@ def check(data: Dataset) -> None:
         raise ValueError("ps: all images are black in the mask; check the images, their exposure and the mask")
     if len(data.values) < FEWEST:
         raise ValueError(f"ps: the mask has {len(data.values)} pixels, at least {FEWEST} are needed; check mask.png")
+    if count := int(unlit(data).sum()):
+        log.warning(
+            "ps: %d dark pixels at the border of the mask are taken for the background; check mask.png if they are not",
+            count,
+        )
     if share := data.clipped.mean():
         log.warning(
             "ps: %.2g %% of the values are clipped: they equal the largest one, and do not count; expose less",

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from photometric import glossy
 from PIL import Image
+from scipy import ndimage
 
 from rimlight import ggx
 from rimlight.cli import main
@@ -30,7 +31,7 @@ from rimlight.inverse.photometric_stereo import (
 )
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
 from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
-from rimlight.inverse.photometric_stereo.rendering import Rendering
+from rimlight.inverse.photometric_stereo.rendering import Rendering, unlit
 
 N = 24
 QUICK = {"resolutions": (1.0,), "iterations": (2,), "max_depth": 2, "brightness": 0.0}
@@ -140,13 +141,39 @@ def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     assert "of the surface is taken back" in output.judgement(found)[-1]
 
 
-def test_a_result_must_win_in_both() -> None:
-    state = lambda left_out, halves: alternation.State(None, None, Kind(), left_out=left_out, halves=halves)
-    start = state(0.1, 5.0)
-    assert state(0.09, 4.9).beats(start)
-    assert not state(0.09, 5.1).beats(start)
-    assert not state(0.11, 4.0).beats(start)
-    assert state(np.nan, np.nan).beats(state(np.nan, np.nan))
+def test_a_result_must_win_in_all() -> None:
+    state = lambda left_out, halves, curl: alternation.State(
+        None, None, Kind(), left_out=left_out, halves=halves, curl=curl
+    )
+    start = state(0.1, 5.0, 2.0)
+    assert state(0.09, 4.9, 2.9).beats(start)
+    assert not state(0.09, 5.1, 1.0).beats(start)
+    assert not state(0.11, 4.0, 1.0).beats(start)
+    assert not state(0.09, 4.0, 3.1).beats(start)
+    nothing = state(np.nan, np.nan, np.nan)
+    assert nothing.beats(nothing)
+
+
+def test_background_in_the_mask(matte: Dataset, caplog: pytest.LogCaptureFixture) -> None:
+    """Its dark pixels, of any normals, do not wall in the object; dark parts of the object stay what they are."""
+    mask = ndimage.binary_dilation(matte.mask, iterations=2)
+    old = matte.mask[mask]
+    values = np.zeros((len(old), *matte.values.shape[1:]), np.float32)
+    values[old] = matte.values
+    values[~old] = 0.03 * matte.typical * np.random.default_rng(0).random(values[~old].shape, np.float32)
+    wide = dataclasses.replace(matte, mask=mask, values=values, truth=None)
+    np.testing.assert_array_equal(unlit(wide), ~old)
+    inside = matte.image(np.arange(len(matte.values)) == len(matte.values) // 2)[matte.mask]
+    values = np.where(inside[:, None, None], 0, matte.values)
+    assert not unlit(dataclasses.replace(matte, values=values)).any()
+    assert not unlit(dataclasses.replace(matte, values=np.zeros_like(values))).any()
+    found = ps.reconstruct(wide, ps.Options(**QUICK, reflectance=False), progress=False)
+    assert "taken for the background" in caplog.text
+    assert angles(found.guess.normals[old], matte.truth).mean() < 1
+    depth = found.depth[found.domain.inner]
+    without = ps.reconstruct(matte, ps.Options(**QUICK, reflectance=False), progress=False)
+    off = depth[old] - without.depth[without.domain.inner]
+    assert np.ptp(off) < 1
 
 
 def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
