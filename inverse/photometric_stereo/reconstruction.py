@@ -30,8 +30,8 @@ from .refinement import Descent, descend
 from .rendering import Rendering
 
 #: Alternations of each kind of material, from the best state of the simplest: with the normals of the start, anything
-#: may look like a coat.
-SETTLED = 3
+#: may look like a coat. And at the largest size, of the same kind with a coat, or without: small pixels show it better.
+SETTLED, RECONSIDERED = 3, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +109,12 @@ class Options:
         several = (False, True) if self.materials is None and self.albedo else (self.materials == "several",)
         coat = (False, True) if self.coat is None else (self.coat,)
         return tuple(Kind(s, c) for s in several for c in coat)
+
+    def others(self) -> tuple[int, int]:
+        """Alternations that compare kinds of material: at the smallest size, and at the largest."""
+        kinds = self.kinds()
+        again = len(self.resolutions) > 1 and len({kind.coat for kind in kinds}) > 1
+        return SETTLED * len(kinds) if len(kinds) > 1 else 0, RECONSIDERED if again else 0
 
 
 @dataclass
@@ -214,8 +220,7 @@ class Reconstruction:
     def finish(self, progress: bool = True) -> Result:
         options, now = self.options, self.now
         self.before, self.began = now.seconds, time.perf_counter()
-        others = SETTLED * len(self.kinds) if len(self.kinds) > 1 else 0
-        total = sum(options.iterations) + others + options.descent.steps
+        total = sum(options.iterations) + sum(options.others()) + options.descent.steps
         with tqdm(total=total, initial=len(now.history), desc="ps", disable=not progress) as self.bar:
             result: Result | None = None
             while now.level < len(options.resolutions):
@@ -240,6 +245,9 @@ class Reconstruction:
         plan = [(now.kind, options.iterations[now.level])]
         if now.level == 0 and judge.able and len(self.kinds) > 1:
             plan += [(kind, SETTLED) for kind in self.kinds]
+        elif now.level == len(options.resolutions) - 1 and judge.able:
+            same = (kind for kind in self.kinds if kind.several == now.kind.several and kind != now.kind)
+            plan += [(kind, RECONSIDERED) for kind in same]
         for kind, most in plan[now.trial :]:
             view, self.work = None, None  # of Dr.Jit's scenes one at a time
             self.work = Alternations(level, self.lobes, kind, judge, options, self.rng)
