@@ -57,8 +57,11 @@ class State:
     start: bool = False
 
     def better_than(self, other: State | None) -> bool:
-        """Where nothing can be left out, what is newer is."""
-        return other is None or not self.left_out >= other.left_out
+        """Where nothing can be left out, what is newer is. Under a coat, it must predict better by more than its
+        standard error: there, normals may drift along what predictions hardly tell."""
+        if other is None:
+            return True
+        return not self.left_out >= other.left_out - (self.uncertain if self.kind.coat else 0)
 
     def beats(self, start: State) -> bool:
         """Does it predict better than the start, do its normals depend less on which lights tell them, and are they
