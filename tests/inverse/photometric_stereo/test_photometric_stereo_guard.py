@@ -21,6 +21,7 @@ from rimlight.exr import read_exr, replacing
 from rimlight.inverse import photometric_stereo as ps
 from rimlight.inverse.photometric_stereo import (
     alternation,
+    cost,
     dataset,
     least_squares,
     output,
@@ -152,6 +153,39 @@ def test_a_result_must_win_in_all() -> None:
     assert not state(0.09, 4.0, 3.1).beats(start)
     nothing = state(np.nan, np.nan, np.nan)
     assert nothing.beats(nothing)
+
+
+def test_other_materials_must_be_clearly_better() -> None:
+    """By more than a standard error, and predictions and halves of the lights together by a part."""
+    state = lambda left_out, halves, kind: alternation.State(
+        None, None, kind, left_out=left_out, uncertain=0.004, halves=halves
+    )
+    plain = state(0.1, 5.0, Kind())
+    assert state(0.09, 4.0, Kind(several=True)).needed_beside(plain)
+    assert not state(0.09, 4.5, Kind(several=True)).needed_beside(plain)
+    assert not state(0.097, 3.0, Kind(several=True)).needed_beside(plain)
+    assert state(0.099, 5.0, Kind()).better_than(plain)
+    coated = state(0.1, 5.0, Kind(coat=True))
+    assert not state(0.097, 3.0, Kind(coat=True)).better_than(coated)
+    assert state(0.095, 5.0, Kind(coat=True)).better_than(coated)
+
+
+def test_the_coat_is_reconsidered_at_the_largest_size(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    run = alternation.Alternations.run
+
+    def noted(self, course, record, view=None):
+        made.append((self.data.mask.shape[0], self.kind, course.most))
+        return run(self, course, record, view)
+
+    monkeypatch.setattr(alternation.Alternations, "run", noted)
+    options = ps.Options(resolutions=(0.5, 1.0), iterations=(1, 1), max_depth=2, brightness=0.0, materials="one")
+    ps.reconstruct(matte, options, progress=False)
+    assert [(kind, most) for size, kind, most in made if size == N // 2] == [
+        (Kind(), 1), (Kind(), 3), (Kind(coat=True), 3)]  # fmt: skip
+    kinds = [kind for size, kind, _ in made if size == N]
+    assert sorted(kind.coat for kind in kinds) == [False, True]
+    assert options.others() == (6, 2) and cost.seconds(100, 12, options) > 0
 
 
 def test_background_in_the_mask(matte: Dataset, caplog: pytest.LogCaptureFixture) -> None:
