@@ -275,13 +275,46 @@ def run(seed: int) -> Row:
     return row
 
 
+def table(rows: list[dict]) -> str:
+    """Of sets with what they have in common, a line each."""
+    groups: dict[str, list[dict]] = {"all": rows}
+    for low, high in ((8, 15), (16, 39), (40, 96)):
+        groups[f"{low} to {high} lights"] = [row for row in rows if low <= row["lights"] <= high]
+    material = lambda row: row["label"].split(", ")[1:]
+    several = lambda row: "|" in ", ".join(material(row))
+    groups["one material"] = [row for row in rows if not several(row)]
+    groups["two or three materials"] = [row for row in rows if several(row)]
+    for name in ("none of these", *(name for name, _, _ in FAULTS)):
+        groups[name] = [row for row in rows if (name in row["faults"] if row["faults"] else name == "none of these")]
+    lines = [
+        "| sets | number | start: median error | result: median error | start kept | worse by more than 0.2° | "
+        "largest loss | errors raised |",
+        "|---|" + "---:|" * 7,
+    ]
+    for name, of_group in groups.items():
+        done = [row for row in of_group if not row["raised"]]
+        if not done:
+            continue
+        before, after = (np.array([row[key] for row in done]) for key in ("before", "after"))
+        kept = sum(row["verdict"] == "start" for row in done)
+        lines.append(
+            f"| {name} | {len(of_group)} | {np.median(before):.1f}° | {np.median(after):.1f}° | {kept} | "
+            f"{(after > before + WORSE).sum()} | {max((after - before).max(), 0):.2f}° | {len(of_group) - len(done)} |"
+        )
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 20), help="first seed, and the one after the last")
     parser.add_argument("--only", type=int, nargs="*", help="these seeds")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, help="rows as JSON, one a line; seeds that it has are not repeated")
+    parser.add_argument("--table", type=Path, nargs="+", help="make a table of such files, and nothing else")
     args = parser.parse_args()
+    if args.table:
+        print(table([json.loads(line) for file in args.table for line in file.read_text("utf-8").splitlines()]))
+        return
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     dr.set_thread_count(1)  # sets are small: processes make better use of several cores
