@@ -175,7 +175,7 @@ class Judge:
         pixels : others than its own. The rest is as of `errors`; the material is that of the guess.
         """
         pixels = self.pixels() if pixels is None else pixels
-        few, counts = self._few(pixels), (self.counts * seen)[pixels].astype(np.float32)
+        few, counts = self._few(pixels), (self.counts[pixels] * seen[pixels]).astype(np.float32)
         indirect = None if indirect is None else indirect[pixels]
         model = DirectModel(few, self.lobes, points=points[pixels], counts=counts, indirect=indirect)
         lights = None if lights is None else _of(lights, pixels)

@@ -124,8 +124,7 @@ class Result:
     "judged", if something else predicts better; "not judged", with too few lights to leave any out. left_out : how far
     predictions of "start" and "result" are off, in the mean value of each pixel. halves : of both, the mean angle
     between normals of one half of the lights and of the other, degrees. curl : of both, that between normals and those
-    of the depth that is integrated from them. taken_back : part of the surface whose normals
-    are those of the start.
+    of the depth that is integrated from them. taken_back : part of the surface whose normals are those of the start.
     history : for each alternation, the size of the images, seconds since the start, the root mean square residual over
     the median value, and where the truth is known the mean angular error, degrees."""
 
