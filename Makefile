@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: setup demo test test-fast test-full mutants bench docs lint dist clean
+.PHONY: setup demo test test-fast test-full mutants bench photometric docs lint dist clean
 
 setup: $(STAMP)
 
@@ -42,6 +42,16 @@ mutants: setup
 NAME ?= film_boundary soft_shadow hard_shadow depth_map glossy global_illumination scaling rig integration reflectance photometric_stereo single_image
 bench: setup
 	for name in $(NAME); do $(BIN)/python tests/benchmarks/bm_$$name.py || exit 1; done
+
+# The numbers of photometric stereo, at one commit. DILIGENT is a copy of that data set, CAMERA its intrinsic matrix: some
+# hours
+DILIGENT ?= ../shared/data/diligent
+CAMERA ?= $(DILIGENT)/bear_depth/K.txt
+photometric: setup
+	$(BIN)/python tests/benchmarks/bm_photometric_stereo.py
+	$(BIN)/python tests/benchmarks/glazed_figures.py
+	$(BIN)/python tests/benchmarks/diligent.py $(DILIGENT) --camera $(CAMERA)
+	$(BIN)/python tests/random_photometric.py --seeds 4000 4200 --processes 2
 
 DEMO := docs/_build/extra/demo/index.html
 $(DEMO): inverse/demo.py $(STAMP)

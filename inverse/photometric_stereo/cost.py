@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from .direct import SAMPLED
-from .reconstruction import SETTLED, Options
+from .reconstruction import Options
 
 #: Bytes of the program; for each value, which is that of a pixel in an image, of reading; of a reconstruction at full
 #: size, for each value and for each pixel; and more for each value with near lights. Measured.
@@ -26,11 +26,11 @@ def memory(pixels: int, images: int, options: Options, *, near: bool = False) ->
 def seconds(pixels: int, images: int, options: Options, cores: int | None = None) -> float:
     """Without descent, if no alternation is spared. Right within a factor of about three. cores : default: all."""
     cores = cores or os.cpu_count() or 1
-    kinds = len(options.kinds())
+    counts = list(options.iterations)
+    for level, others in zip((0, -1), options.others(), strict=True):
+        counts[level] += others
     total = 0.0
-    for level, (size, count) in enumerate(zip(options.resolutions, options.iterations, strict=True)):
-        if level == 0 and kinds > 1:
-            count += SETTLED * kinds
+    for size, count in zip(options.resolutions, counts, strict=True):
         seen = pixels * size**2
         total += count * (OF_ALL + images * (OF_VALUES * seen / cores + OF_BSDF * min(seen, SAMPLED)))
     return total

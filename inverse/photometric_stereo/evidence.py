@@ -3,6 +3,9 @@
 Of each pixel, the values under some lights are left out: under a few lights all, and of blocks of pixels those under
 others. What is a pixel's own (its normal, its albedo or colour) and the BSDF are found once more from the values that
 are kept, and predict the others. A state that explains the images for a wrong reason does that badly.
+
+What predicts values well may still have wrong normals. So normals are found twice, from one half of the lights and from
+the other: those of a wrong model depend on where the lights are.
 """
 
 from __future__ import annotations
@@ -15,8 +18,8 @@ import numpy as np
 from rimlight import ggx
 
 from . import least_squares
-from .dataset import Dataset
-from .direct import DirectModel, Guess
+from .dataset import Dataset, angles
+from .direct import DirectModel, Guess, own
 
 #: Part of the lights that are left out whole, and part of those of each block of pixels; its width, pixels.
 WHOLE, OF_BLOCKS, BLOCK = 0.1, 0.1, 8
@@ -29,6 +32,12 @@ JUDGED = 800
 
 #: Fits of the BSDF and of what is a pixel's own, in turns, to the values that are kept.
 REFITS = 2
+
+#: Steps by which normals follow one half of the lights, and fewest values of a pixel that tell its normal.
+STEPS, TELLING = 4, 3
+
+#: Normals of both halves differ at most so much, degrees: more is as wrong.
+FAR = 30.0
 
 #: Deviations of a prediction count at most so much, of the mean value of the pixel: shadows and highlights that are a
 #: pixel beside their place.
@@ -78,6 +87,14 @@ def left_out(data: Dataset, seed: int) -> np.ndarray:
     return found
 
 
+def halves(lights: np.ndarray) -> list[np.ndarray]:
+    """Ways to part lights, (K, 3), in halves: which are in the first, (K,), bool. Left and right, below and above, two
+    opposite quadrants and the others, inside and outside."""
+    x, y = (lights[:, :2] - np.median(lights[:, :2], axis=0)).T
+    away = np.hypot(x, y)
+    return [x > 0, y > 0, x * y > 0, away > np.median(away)]
+
+
 @dataclass(frozen=True)
 class Judge:
     """Of the states of one size.
@@ -111,25 +128,23 @@ class Judge:
         seen: np.ndarray,
         indirect: np.ndarray | None,
         *,
-        lights: np.ndarray | None = None,
+        lights: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Mean deviation of what is predicted from what was left out, of each of its pixels, over their mean values.
 
         seen, indirect : what the depth of the state hides, (P, K), and reflects, (P, K, 3).
-        lights : directions, (K, 3) or (P, K, 3). If they are given, the state is a start: its normals are those that
-            the method of the start finds from what is kept, and stay as they are.
+        lights : directions and irradiance, as of `DirectModel.lighting`. If they are given, the state is a start: its
+            normals are those that the method of the start finds from what is kept, and stay as they are.
         """
         pixels = self.pixels()
-        mask = np.zeros_like(self.data.mask)
-        mask[tuple(x[pixels] for x in np.nonzero(self.data.mask))] = True
-        few = replace(self.data, mask=mask, values=self.data.values[pixels], truth=None)
+        few = self._few(pixels)
         left, counts, seen = self.left[pixels], self.counts[pixels], seen[pixels]
         kept = (counts * seen * ~left).astype(np.float32)
         indirect = None if indirect is None else indirect[pixels]
         model = DirectModel(few, self.lobes, points=points[pixels], counts=kept, indirect=indirect)
         trial, turn = kind.of(guess.of(pixels), self.lobes), lights is None
         if not turn:
-            trial.normals = self._started(few, trial.exposures, ~left, lights if lights.ndim == 2 else lights[pixels])
+            trial.normals = self._started(few, trial.exposures, ~left, _of(lights, pixels))
         rng = np.random.default_rng([self.seed, 19])
         for _ in range(REFITS):
             model.fit_bsdf(trial, rng, coat=kind.coat, turn=turn)
@@ -144,10 +159,62 @@ class Judge:
         w = left * counts
         return (w * deviation).sum(1) / np.maximum(w.sum(1), 1e-9)
 
-    def _started(self, few: Dataset, exposures: np.ndarray, kept: np.ndarray, lights: np.ndarray) -> np.ndarray:
+    def disagreement(
+        self,
+        guess: Guess,
+        points: np.ndarray,
+        seen: np.ndarray,
+        indirect: np.ndarray | None,
+        *,
+        lights: tuple[np.ndarray, np.ndarray] | None = None,
+        pixels: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Angle between the normals that one half of the lights tells and those of the other, degrees, mean over some
+        ways to part the lights, of each of its pixels. NaN where halves do not tell normals.
+
+        pixels : others than its own. The rest is as of `errors`; the material is that of the guess.
+        """
+        pixels = self.pixels() if pixels is None else pixels
+        few, counts = self._few(pixels), (self.counts[pixels] * seen[pixels]).astype(np.float32)
+        indirect = None if indirect is None else indirect[pixels]
+        model = DirectModel(few, self.lobes, points=points[pixels], counts=counts, indirect=indirect)
+        lights = None if lights is None else _of(lights, pixels)
+
+        def found(half: np.ndarray) -> np.ndarray:
+            if lights is not None:
+                return self._started(few, guess.exposures, np.broadcast_to(half, counts.shape), lights)
+            model.counts = own(counts * half)
+            turned = guess.of(pixels)
+            model.fit_normals(turned, steps=STEPS)
+            return turned.normals
+
+        total, number = np.zeros(len(pixels)), np.zeros(len(pixels))
+        for half in halves(model.mean_directions()):
+            told = np.minimum(*((counts[:, part] > 0).sum(1) for part in (half, ~half))) >= TELLING
+            total += told * np.minimum(angles(found(half), found(~half)), FAR)
+            number += told
+        return np.divide(total, number, out=np.full(len(pixels), np.nan), where=number > 0)
+
+    def _few(self, pixels: np.ndarray) -> Dataset:
+        """The data of some pixels, their numbers ascending."""
+        mask = np.zeros_like(self.data.mask)
+        mask[tuple(x[pixels] for x in np.nonzero(self.data.mask))] = True
+        return replace(self.data, mask=mask, values=self.data.values[pixels], truth=None)
+
+    def _started(
+        self, few: Dataset, exposures: np.ndarray, kept: np.ndarray, lights: tuple[np.ndarray, np.ndarray]
+    ) -> np.ndarray:
         """Normals by the method of the start, from values that are kept. As many are of each pixel."""
+        directions, irradiance = lights
         count = kept.sum(1).min()
         chosen = np.argsort(~kept, axis=1, kind="stable")[:, :count]
-        values = np.take_along_axis(few.luminance / exposures, chosen, 1)
-        at = lights[chosen] if lights.ndim == 2 else np.take_along_axis(lights, chosen[..., None], 1)
+        values = least_squares.as_at_infinity(few.luminance / exposures, irradiance)
+        values = np.take_along_axis(values, chosen, 1)
+        at = directions[chosen] if directions.ndim == 2 else np.take_along_axis(directions, chosen[..., None], 1)
         return least_squares.normals(values, at, self.start)
+
+
+def _of(lights: tuple[np.ndarray, np.ndarray], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions and irradiance at some pixels."""
+    directions, irradiance = lights
+    return lights if directions.ndim == 2 else (directions[pixels], irradiance[pixels])

@@ -37,6 +37,11 @@ def least_squares(values: np.ndarray, lights: np.ndarray, weights: np.ndarray | 
     return (np.linalg.pinv(M, rcond=1e-9, hermitian=True) @ b[..., None])[..., 0]
 
 
+def as_at_infinity(values: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+    """Values as of lights at infinity, (P, K). 0 where a light does not shine."""
+    return np.divide(values, irradiance, out=np.zeros(values.shape), where=irradiance > 1e-6 * irradiance.max())
+
+
 def ranks(values: np.ndarray) -> np.ndarray:
     """Of the values of each pixel, from 0, the darkest, to 1: (P, K)."""
     return np.argsort(np.argsort(values, axis=1), axis=1) / (values.shape[1] - 1)

@@ -77,6 +77,9 @@ def write_numbers(
         "verdict": result.verdict,
         "materials": "one" if guess.base is None else "several",
         "left_out": {name: None if np.isnan(error) else error for name, error in result.left_out.items()},
+        "halves": {name: None if np.isnan(angle) else angle for name, angle in result.halves.items()},
+        "curl": {name: None if np.isnan(angle) else angle for name, angle in result.curl.items()},
+        "taken_back": result.taken_back,
         "seconds": round(result.seconds, 3),
         "size": [*data.mask.shape[::-1]],
         "pixels": len(data.values),
@@ -130,8 +133,19 @@ def judgement(result: Result) -> list[str]:
         return ["too few lights to leave any out: the last alternation was kept"] if result.left_out else []
     start, found = (f"{100 * result.left_out[name]:.3g} %" for name in ("start", "result"))
     if result.verdict == "start":
-        return [f"the start is kept, for it predicts values that were left out as well as anything: {start} off"]
-    return [f"values that were left out are predicted {found} off, by the start {start}"]
+        return [
+            "the start is kept, for nothing predicts values that were left out better and has normals that depend less "
+            f"on which lights tell them and are those of a surface: {start} off"
+        ]
+    sentences = [f"values that were left out are predicted {found} off, by the start {start}"]
+    if np.isfinite(list(result.halves.values())).all():
+        start, found = (f"{result.halves[name]:.2g}°" for name in ("start", "result"))
+        sentences.append(
+            f"normals of one half of the lights and of the other differ by {found}, at the start by {start}"
+        )
+    if result.taken_back > 0:
+        sentences.append(f"{100 * result.taken_back:.2g} % of the surface is taken back to the start")
+    return sentences
 
 
 def depth(result: Result) -> np.ndarray:

@@ -41,7 +41,7 @@ class Progress:
     level : number of the size of the images. kind : of the material with which its alternations begin.
     trial : which alternations of this size: 0 with that kind, then those of other kinds of material.
     start : of this size, judged. settled : result of trial 0. best : of the trials that ended. course : of this trial.
-    first : normals of the first start.
+    first : normals of the first start. back : part of the surface that was taken back to the start at the end.
     history, seconds : as of `Result`.
     """
 
@@ -53,6 +53,7 @@ class Progress:
     best: State | None = None
     course: Course | None = None
     first: np.ndarray | None = None
+    back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -68,7 +69,7 @@ class Progress:
     def best_so_far(self) -> State:
         """Of this size: of the trials that ended, the states of this one, and the start."""
         best = self.best if self.course is None else self._chosen(self.course.best)
-        return self.start if self.start.left_out < best.left_out else best
+        return best if best.beats(self.start) else self.start
 
     def _chosen(self, found: State) -> State:
         """The better of the best of the trials and a state of the present one: another kind of material must be clearly
@@ -169,7 +170,7 @@ def fingerprints(data: Dataset) -> dict[str, str]:
 
 
 def _facts_of(state: State) -> dict[str, Any]:
-    facts = {"left_out": state.left_out, "uncertain": state.uncertain, "start": state.start}
+    facts = {name: getattr(state, name) for name in ("left_out", "uncertain", "halves", "curl", "start")}
     return {**facts, "kind": dataclasses.astuple(state.kind), "base_eta": float(state.guess.base_eta)}
 
 

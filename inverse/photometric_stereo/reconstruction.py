@@ -21,7 +21,7 @@ from tqdm import tqdm
 from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
-from . import least_squares, start
+from . import least_squares, start, taking_back
 from .alternation import Alternations, Course, State, View
 from .dataset import Dataset, angles
 from .direct import Guess
@@ -31,8 +31,8 @@ from .refinement import Descent, descend
 from .rendering import Rendering
 
 #: Alternations of each kind of material, from the best state of the simplest: with the normals of the start, anything
-#: may look like a coat.
-SETTLED = 3
+#: may look like a coat. And at the largest size, of the same kind with a coat, or without: small pixels show it better.
+SETTLED, RECONSIDERED = 3, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,13 +111,21 @@ class Options:
         coat = (False, True) if self.coat is None else (self.coat,)
         return tuple(Kind(s, c) for s in several for c in coat)
 
+    def others(self) -> tuple[int, int]:
+        """Alternations that compare kinds of material: at the smallest size, and at the largest."""
+        kinds = self.kinds()
+        again = len(self.resolutions) > 1 and len({kind.coat for kind in kinds}) > 1
+        return SETTLED * len(kinds) if len(kinds) > 1 else 0, RECONSIDERED if again else 0
+
 
 @dataclass
 class Result:
     """normals : (P, 3). depth : (Q,), of the pixels of `domain`. weights : (B, 3), with `scale` the BSDF of the images.
     kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and so was kept;
     "judged", if something else predicts better; "not judged", with too few lights to leave any out. left_out : how far
-    predictions of "start" and "result" are off, in the mean value of each pixel.
+    predictions of "start" and "result" are off, in the mean value of each pixel. halves : of both, the mean angle
+    between normals of one half of the lights and of the other, degrees. curl : of both, that between normals and those
+    of the depth that is integrated from them. taken_back : part of the surface whose normals are those of the start.
     history : for each alternation, the size of the images, seconds since the start, the root mean square residual over
     the median value, and where the truth is known the mean angular error, degrees."""
 
@@ -131,6 +139,9 @@ class Result:
     kind: Kind
     verdict: str = "not judged"
     left_out: dict[str, float] = field(default_factory=dict)
+    halves: dict[str, float] = field(default_factory=dict)
+    curl: dict[str, float] = field(default_factory=dict)
+    taken_back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -209,8 +220,7 @@ class Reconstruction:
     def finish(self, progress: bool = True) -> Result:
         options, now = self.options, self.now
         self.before, self.began = now.seconds, time.perf_counter()
-        others = SETTLED * len(self.kinds) if len(self.kinds) > 1 else 0
-        total = sum(options.iterations) + others + options.descent.steps
+        total = sum(options.iterations) + sum(options.others()) + options.descent.steps
         with tqdm(total=total, initial=len(now.history), desc="ps", disable=not progress) as self.bar:
             result: Result | None = None
             while now.level < len(options.resolutions):
@@ -235,6 +245,9 @@ class Reconstruction:
         plan = [(now.kind, options.iterations[now.level])]
         if now.level == 0 and judge.able and len(self.kinds) > 1:
             plan += [(kind, SETTLED) for kind in self.kinds]
+        elif now.level == len(options.resolutions) - 1 and judge.able:
+            same = (kind for kind in self.kinds if kind.several == now.kind.several and kind != now.kind)
+            plan += [(kind, RECONSIDERED) for kind in same]
         for kind, most in plan[now.trial :]:
             view, self.work = None, None  # of Dr.Jit's scenes one at a time
             self.work = Alternations(level, self.lobes, kind, judge, options, self.rng)
@@ -243,20 +256,34 @@ class Reconstruction:
             elif now.course is None:
                 now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=np.nan), most)
             now.end_trial(self.work.run(now.course, self._record, view))
+        if now.level == len(options.resolutions) - 1:
+            self._take_back()
         return self._result()
+
+    def _take_back(self) -> None:
+        """To the start, what of the best state depends more on which lights tell it."""
+        now, best = self.now, self.now.best_so_far()
+        if best.start or not self.work.judge.able:
+            return
+        if self.work.kind != best.kind:
+            work, self.work = self.work, None
+            self.work = Alternations(work.data, self.lobes, best.kind, work.judge, self.options, self.rng)
+        lights = start.flat(self.work.data).lighting()
+        now.best, now.back = taking_back.taken_back(self.work, best, now.start, lights)
 
     def _begin(self, most: int, coarse: Result | None) -> View | None:
         """Judge the start of a size, and begin its alternations. Returns the view of their first state, if known."""
         now, options, work = self.now, self.options, self.work
         guess = start.guess(work.data, self.lobes, work.judge.counts, options)
-        now.start, view = work.judged_start(guess, start.flat(work.data).lighting()[0], self.kinds)
+        now.start, view = work.judged_start(guess, start.flat(work.data).lighting(), self.kinds)
         if coarse is None:
             now.first = guess.normals
             now.course = Course(copy.deepcopy(now.start), most)
             return None if work.kind.several else view  # of several, the guess is another one
         sides = [round(1 / options.resolutions[i]) for i in (now.level - 1, now.level)]
         guess = start.refined(coarse.guess, coarse.domain, work.data, before=sides[0], now=sides[1])
-        now.course = Course(State(guess, work.integrate(guess), work.kind), most)
+        # Never the best, for it was not fitted to these images, though what is fitted to it may predict well
+        now.course = Course(State(guess, work.integrate(guess), work.kind, left_out=np.inf), most)
         return None
 
     def _record(self, residual: float) -> None:
@@ -293,6 +320,9 @@ class Reconstruction:
             best.kind,
             verdict="start" if best.start else "judged" if work.judge.able else "not judged",
             left_out={"start": now.start.left_out, "result": best.left_out},
+            halves={"start": now.start.halves, "result": best.halves},
+            curl={"start": now.start.curl, "result": best.curl},
+            taken_back=1.0 if best.start else now.back,
             history=now.history,
             seconds=now.seconds,
         )

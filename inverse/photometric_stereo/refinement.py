@@ -19,7 +19,6 @@ from . import laplacian
 from .dataset import Dataset, unit
 from .descent import ExponentiatedGradient, NormalAdam
 from .direct import HUBER, DirectModel, Guess
-from .integration import normals_of
 from .rendering import Domain, Rendering
 
 log = logging.getLogger(__name__)
@@ -119,7 +118,7 @@ def descend(
             offset -= offset.mean()
         depth = _moved(domain, integrated(), offset)
         if options.depth_rate > 0 and options.integrability > 0:
-            of_depth = _normals(domain, depth)
+            of_depth = domain.normals(depth)
             guess.normals = unit(guess.normals + options.integrability * (of_depth - guess.normals))
             offset = _in_pixels(domain, depth) - _in_pixels(domain, integrated())
         if after is not None:
@@ -135,13 +134,6 @@ def _in_pixels(domain: Domain, depth: np.ndarray) -> np.ndarray:
 
 def _moved(domain: Domain, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return depth + pixels if domain.camera is None else depth * np.exp(pixels / domain.camera[0, 0])
-
-
-def _normals(domain: Domain, depth: np.ndarray) -> np.ndarray:
-    """Of depth, (P, 3)."""
-    wide = np.full(domain.wide.shape, np.nan)
-    wide[domain.wide] = depth
-    return normals_of(wide, domain.wide, camera=domain.camera)[domain.wide][domain.inner]
 
 
 def _smoothed(domain: Domain, depth: np.ndarray, gradient: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from rimlight.edge_sampling.refusals import InputError
 
 from .dataset import Dataset
 from .direct import Guess, Lighting, bsdf_of, own
-from .integration import integrate, mesh_of
+from .integration import integrate, mesh_of, normals_of
 
 #: Distance of an orthographic camera from the surface, over the size of the image.
 FAR = 2.0
@@ -29,11 +29,17 @@ EVEN = 0.1
 ABOVE = 0.5
 
 
+#: Pixels at the border of the mask that are darker than this part of the median pixel under so many of the lights are
+#: taken for the background's, unless they are more than this part of the mask.
+UNLIT, BRIGHT, MOST_UNLIT = 0.05, 0.9, 0.5
+
+
 class Domain:
     """The pixels of the mask and a ring around them, so that the mesh covers the pixels of the mask entirely.
 
     wide : (H + 2, W + 2), bool: the mask, one pixel larger on all sides, with that ring; Q pixels. nearest : (Q,), for
-    each of them the nearest of the P pixels of the mask. inner : (P,), for each of these its number among the Q.
+    each of them the nearest of the P pixels of the mask that are `lit`, (P,), bool, itself if it is one of these: that
+    are not `unlit`. inner : (P,), for each of these its number among the Q.
     camera : of the larger image.
     """
 
@@ -42,7 +48,8 @@ class Domain:
         self.wide = ndimage.binary_dilation(mask, np.ones((3, 3)))
         number = np.zeros(mask.shape, np.int64)
         number[mask] = np.arange(mask.sum())
-        _, (row, column) = ndimage.distance_transform_edt(~mask, return_indices=True)
+        self.lit = ~unlit(data)
+        _, (row, column) = ndimage.distance_transform_edt(~np.pad(data.image(self.lit), 1), return_indices=True)
         self.nearest = number[row, column][self.wide]
         self.inner = np.flatnonzero(mask[self.wide])
         self.camera = None
@@ -58,6 +65,12 @@ class Domain:
         wide[self.wide] = normals[self.nearest]
         return self.distance * integrate(wide, self.wide, camera=self.camera, bilateral=bilateral)[self.wide]
 
+    def normals(self, depth: np.ndarray) -> np.ndarray:
+        """Of depth, (P, 3)."""
+        wide = np.full(self.wide.shape, np.nan)
+        wide[self.wide] = depth
+        return normals_of(wide, self.wide, camera=self.camera)[self.wide][self.inner]
+
     def mesh(self, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Vertices, (Q, 3), and faces."""
         wide = np.full(self.wide.shape, np.nan)
@@ -67,6 +80,17 @@ class Domain:
     def points(self, depth: np.ndarray) -> np.ndarray:
         """What the P pixels of the mask show: (P, 3)."""
         return self.mesh(depth)[0][self.inner]
+
+
+def unlit(data: Dataset) -> np.ndarray:
+    """Which pixels are the background's rather than the object's, (P,), bool: dark ones at the border of the mask.
+    Their normals would be steep walls of the surface, which cast shadows on what is beside them."""
+    brightness = np.quantile(data.luminance, BRIGHT, axis=1)
+    dark = np.zeros(np.add(data.mask.shape, 2), bool)
+    dark[1:-1, 1:-1] = data.image(brightness < UNLIT * np.median(brightness))
+    outside = np.pad(~data.mask, 1, constant_values=True)
+    found = ndimage.binary_propagation(outside, mask=outside | dark)[1:-1, 1:-1][data.mask]
+    return found if found.mean() <= MOST_UNLIT else np.zeros_like(found)
 
 
 class Rendering:

@@ -15,7 +15,7 @@ from rimlight.edge_sampling.refusals import InputError
 from . import calibration, least_squares
 from .dataset import Dataset, unit
 from .direct import DirectModel, Guess
-from .rendering import Domain
+from .rendering import Domain, unlit
 
 if TYPE_CHECKING:
     from .reconstruction import Options
@@ -42,6 +42,11 @@ def check(data: Dataset) -> None:
         raise InputError("ps: all images are black in the mask; check the images, their exposure and the mask")
     if len(data.values) < FEWEST:
         raise InputError(f"ps: the mask has {len(data.values)} pixels, at least {FEWEST} are needed; check mask.png")
+    if count := int(unlit(data).sum()):
+        log.warning(
+            "ps: %d dark pixels at the border of the mask are taken for the background; check mask.png if they are not",
+            count,
+        )
     if share := data.clipped.mean():
         log.warning(
             "ps: %.2g %% of the values are clipped: they equal the largest one, and do not count; expose less",
@@ -54,7 +59,10 @@ def scale(data: Dataset, options: Options) -> float:
     if not options.brightness:
         return 1.0
     directions, irradiance = flat(data).lighting()
-    b = [least_squares.trimmed(_over(data.values[..., c], irradiance), directions) for c in range(3)]
+    b = [
+        least_squares.trimmed(least_squares.as_at_infinity(data.values[..., c], irradiance), directions)
+        for c in range(3)
+    ]
     return options.brightness / np.pi / max(np.median(np.linalg.norm(x, axis=1)) for x in b)
 
 
@@ -65,16 +73,11 @@ def flat(data: Dataset) -> DirectModel:
     return DirectModel(data, ggx.Lobes((np.nan,), (np.nan,)), points=points)
 
 
-def _over(values: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
-    """Values as of lights at infinity, (P, K). 0 where a light does not shine."""
-    return np.divide(values, irradiance, out=np.zeros(values.shape), where=irradiance > 1e-6 * irradiance.max())
-
-
 def guess(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options) -> Guess:
     """Diffuse, with exposures."""
     plane = flat(data)
     directions, irradiance = plane.lighting()
-    values = _over(data.luminance, irradiance)
+    values = least_squares.as_at_infinity(data.luminance, irradiance)
     solve = least_squares.METHODS[options.start]
     if data.clipped.any():  # what is too bright is known then, and need not be guessed
         told = least_squares.telling(counts > 0, directions)[:, None]

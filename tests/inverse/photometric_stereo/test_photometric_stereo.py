@@ -253,8 +253,9 @@ def test_coat_needs_evidence(plastic: Scene, coat: bool) -> None:
         for _ in range(4):
             model.fit_bsdf(guess, rng, coat=kind.coat)
             model.fit_normals(guess)
-        errors = judge_of(data, lobes).errors(guess, kind, *seen_by_all(data))
-        states.append(State(guess, plastic.depth, kind, errors.mean(), errors.std() / np.sqrt(len(errors))))
+        judge, seen = judge_of(data, lobes), seen_by_all(data)
+        errors, halves = judge.errors(guess, kind, *seen), np.nanmean(judge.disagreement(guess, *seen))
+        states.append(State(guess, plastic.depth, kind, errors.mean(), errors.std() / np.sqrt(len(errors)), halves))
     plain, with_coat = states
     assert with_coat.needed_beside(plain) == coat
     found = states[coat].guess

@@ -11,15 +11,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from photometric import glossy
 from PIL import Image
+from scipy import ndimage
 
+from rimlight import ggx
 from rimlight.cli import main
 from rimlight.exr import read_exr, replacing
 from rimlight.inverse import photometric_stereo as ps
-from rimlight.inverse.photometric_stereo import alternation, dataset, least_squares, output, report, simulation
+from rimlight.inverse.photometric_stereo import (
+    alternation,
+    cost,
+    dataset,
+    least_squares,
+    output,
+    report,
+    simulation,
+    start,
+    taking_back,
+)
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
-from rimlight.inverse.photometric_stereo.evidence import Kind
-from rimlight.inverse.photometric_stereo.rendering import Rendering
+from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
+from rimlight.inverse.photometric_stereo.rendering import Rendering, unlit
 
 N = 24
 QUICK = {"resolutions": (1.0,), "iterations": (2,), "max_depth": 2, "brightness": 0.0}
@@ -86,6 +99,116 @@ def test_the_best_state_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(found.guess.normals, states[1])
     assert found.verdict == "judged"
     assert found.left_out == {"start": 4.0, "result": 1.0}
+
+
+def test_normals_of_halves_tell_a_wrong_model(matte: Dataset) -> None:
+    """Of the right material they agree; of a wrong one they depend on where the lights are."""
+    options = ps.Options(**QUICK)
+    lobes = ggx.read_dictionary()[0]
+    counts = np.ones(matte.values.shape[:2], np.float32)
+    judge = Judge(matte, lobes, left_out(matte, 0), counts, 0, "trimmed")
+    work = alternation.Alternations(matte, lobes, Kind(), judge, options, np.random.default_rng(0))
+    guess = start.guess(matte, lobes, counts, options)
+    guess.weights = glossy(lobes)
+    guess.weights[~np.isnan(lobes.eta)] = 0
+    view = work.view(guess, work.integrate(guess))
+    right = judge.disagreement(guess, view.points, view.seen, None)
+    assert np.nanmean(right) < 1
+    guess.weights = glossy(lobes)
+    assert np.nanmean(judge.disagreement(guess, view.points, view.seen, None)) > 2 * np.nanmean(right)
+    shown = np.zeros_like(view.seen)
+    assert np.isnan(judge.disagreement(guess, view.points, shown, None)).all()
+
+
+def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the halves of the lights say that the start is better, it is kept, and elsewhere the result."""
+    states = []
+    left = np.nonzero(matte.mask)[1] < N / 2
+
+    def disagreement(self, guess, points, seen, indirect, *, lights=None, pixels=None):
+        pixels = self.pixels() if pixels is None else pixels
+        return np.full(len(pixels), 2.0) if lights is not None else np.where(left[pixels], 20.0, 0.1)
+
+    monkeypatch.setattr(taking_back, "WIDTH", 1.0)
+    monkeypatch.setattr(Judge, "disagreement", disagreement)
+    monkeypatch.setattr(alternation.State, "beats", lambda self, start: True)
+    options = ps.Options(**QUICK, reflectance=False)
+    found = ps.reconstruct(matte, options, progress=False, after=lambda r: states.append(r.guess.normals.copy()))
+    columns = np.nonzero(matte.mask)[1]
+    far = columns < N / 2 - 4, columns > N / 2 + 4
+    np.testing.assert_allclose(found.guess.normals[far[0]], found.start[far[0]], atol=0.01)
+    assert min(np.abs(found.guess.normals[far[1]] - n[far[1]]).max() for n in states) < 1e-6
+    assert found.taken_back == pytest.approx(0.5, abs=0.1)
+    assert "of the surface is taken back" in output.judgement(found)[-1]
+
+
+def test_a_result_must_win_in_all() -> None:
+    state = lambda left_out, halves, curl: alternation.State(
+        None, None, Kind(), left_out=left_out, halves=halves, curl=curl
+    )
+    start = state(0.1, 5.0, 2.0)
+    assert state(0.09, 4.9, 2.9).beats(start)
+    assert not state(0.09, 5.1, 1.0).beats(start)
+    assert not state(0.11, 4.0, 1.0).beats(start)
+    assert not state(0.09, 4.0, 3.1).beats(start)
+    nothing = state(np.nan, np.nan, np.nan)
+    assert nothing.beats(nothing)
+
+
+def test_other_materials_must_be_clearly_better() -> None:
+    """By more than a standard error, and predictions and halves of the lights together by a part."""
+    state = lambda left_out, halves, kind: alternation.State(
+        None, None, kind, left_out=left_out, uncertain=0.004, halves=halves
+    )
+    plain = state(0.1, 5.0, Kind())
+    assert state(0.09, 4.0, Kind(several=True)).needed_beside(plain)
+    assert not state(0.09, 4.5, Kind(several=True)).needed_beside(plain)
+    assert not state(0.097, 3.0, Kind(several=True)).needed_beside(plain)
+    assert state(0.099, 5.0, Kind()).better_than(plain)
+    coated = state(0.1, 5.0, Kind(coat=True))
+    assert not state(0.097, 3.0, Kind(coat=True)).better_than(coated)
+    assert state(0.095, 5.0, Kind(coat=True)).better_than(coated)
+
+
+def test_the_coat_is_reconsidered_at_the_largest_size(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    run = alternation.Alternations.run
+
+    def noted(self, course, record, view=None):
+        made.append((self.data.mask.shape[0], self.kind, course.most))
+        return run(self, course, record, view)
+
+    monkeypatch.setattr(alternation.Alternations, "run", noted)
+    options = ps.Options(resolutions=(0.5, 1.0), iterations=(1, 1), max_depth=2, brightness=0.0, materials="one")
+    ps.reconstruct(matte, options, progress=False)
+    assert [(kind, most) for size, kind, most in made if size == N // 2] == [
+        (Kind(), 1), (Kind(), 3), (Kind(coat=True), 3)]  # fmt: skip
+    kinds = [kind for size, kind, _ in made if size == N]
+    assert sorted(kind.coat for kind in kinds) == [False, True]
+    assert options.others() == (6, 2) and cost.seconds(100, 12, options) > 0
+
+
+def test_background_in_the_mask(matte: Dataset, caplog: pytest.LogCaptureFixture) -> None:
+    """Its dark pixels, of any normals, do not wall in the object; dark parts of the object stay what they are."""
+    mask = ndimage.binary_dilation(matte.mask, iterations=2)
+    old = matte.mask[mask]
+    values = np.zeros((len(old), *matte.values.shape[1:]), np.float32)
+    values[old] = matte.values
+    values[~old] = 0.03 * matte.typical * np.random.default_rng(0).random(values[~old].shape, np.float32)
+    wide = dataclasses.replace(matte, mask=mask, values=values, truth=None)
+    np.testing.assert_array_equal(unlit(wide), ~old)
+    rows, columns = np.nonzero(matte.mask)
+    middle = (abs(rows - N // 2) < 3) & (abs(columns - N // 2) < 3)
+    values = np.where(middle[:, None, None], 0, matte.values)
+    assert not unlit(dataclasses.replace(matte, values=values)).any()
+    assert not unlit(dataclasses.replace(matte, values=np.zeros_like(values))).any()
+    found = ps.reconstruct(wide, ps.Options(**QUICK, reflectance=False), progress=False)
+    assert "taken for the background" in caplog.text
+    assert angles(found.guess.normals[old], matte.truth).mean() < 1
+    depth = found.depth[found.domain.inner]
+    without = ps.reconstruct(matte, ps.Options(**QUICK, reflectance=False), progress=False)
+    off = depth[old] - without.depth[without.domain.inner]
+    assert np.ptp(off) < 1
 
 
 def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
