@@ -130,11 +130,14 @@ def flush(x: mi.SurfaceInteraction3f, y: mi.SurfaceInteraction3f) -> mi.Bool:
     So do points of one face, and points close to each other on one curved surface: one does not light the other, but
     the cosine between them is what rounding makes it, and its derivative relative to that is arbitrarily large.
     """
+    return in_plane(x, y.p) | in_plane(y, x.p)
+
+
+def in_plane(x: mi.SurfaceInteraction3f, p: mi.Point3f) -> mi.Bool:
+    """Does a point lie in the tangent plane at x, as far as single precision can tell?"""
     with dr.suspend_grad():
-        d = y.p - x.p
-        scale = dr.max(dr.maximum(dr.abs(x.p), dr.abs(y.p)))
-        height = dr.minimum(dr.abs_dot(x.n, d), dr.abs_dot(y.n, d))
-        return height <= FLUSH * dr.epsilon(mi.Float) * scale
+        scale = dr.max(dr.maximum(dr.abs(x.p), dr.abs(p)))
+        return dr.abs_dot(x.n, p - x.p) <= FLUSH * dr.epsilon(mi.Float) * scale
 
 
 # ---------------------- Vicinity ----------------------

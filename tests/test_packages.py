@@ -53,7 +53,8 @@ def test_public_functions_have_types(module):
     untyped = []
     for name in set(module.__all__) - {"__version__"}:
         thing = getattr(module, name)
-        function = thing.__init__ if inspect.isclass(thing) else thing
+        is_protocol = getattr(thing, "_is_protocol", False)
+        function = thing.__call__ if is_protocol else thing.__init__ if inspect.isclass(thing) else thing
         if not inspect.isfunction(inspect.unwrap(function)):
             continue
         signature = inspect.signature(function)

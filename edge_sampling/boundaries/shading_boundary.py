@@ -29,7 +29,7 @@ from rimlight.edge_sampling.choice.sampling import EdgeSample, Reservoir, power_
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Cone, Lobe, View
 from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals
-from rimlight.edge_sampling.parametrisation import Vicinity, material_point
+from rimlight.edge_sampling.parametrisation import Vicinity, in_plane, material_point
 from rimlight.edge_sampling.rays import spawn_ray
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
@@ -242,7 +242,9 @@ class ShadingBoundary:
             ω = (p - x) / distance
             n_dl = dr.cross(ω, outline.tangent) / (distance * sample.density)
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
-            active = active & (sample.density > 0) & dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
+            # Seen along its own face, an edge hides nothing, but rounding decides what a ray past it meets.
+            active = active & (sample.density > 0) & ~in_plane(si, p)
+            active &= dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
             outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
             # Of a crease, both sides are faces of its own.
