@@ -97,9 +97,9 @@ def _of_scene_file(path: Path, define: Mapping[str, str]) -> str:
 
 
 def _of_scene(scene: mi.Scene) -> str:
-    """Of all of its parameters."""
+    """Of all of its parameters, in the order of their names: Mitsuba, which loads in parallel, has them in any order."""
     digest = hashlib.blake2b(digest_size=16)
-    for name, value in mi.traverse(scene).items():
+    for name, value in sorted(mi.traverse(scene).items(), key=lambda item: item[0]):
         value = value.matrix if is_transform(value) else value
         digest.update(f"{name} {type(value).__name__} ".encode())
         digest.update(np.array(value).tobytes() if dr.is_array_v(value) else repr(value).encode())

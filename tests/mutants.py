@@ -184,8 +184,8 @@ MUTANTS = [
     mutant(
         "interior: a lamp lights itself in its own plane",
         PARAMETRISATION,
-        "return height <= FLUSH * dr.epsilon(mi.Float) * scale",
-        "return height < 0",
+        "return in_plane(x, y.p) | in_plane(y, x.p)",
+        "return mi.Bool(False)",
     ),
     # ---------------------- What random scenes have found ----------------------
     mutant(

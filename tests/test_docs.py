@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -88,7 +89,10 @@ COMMANDS = sorted({line for page in PAGES for line in commands(read(page))})
 def test_snippets_run(page, tmp_path):
     script = tmp_path / "snippets.py"
     script.write_text(program(page, blocks(read(page))), encoding="utf-8")
-    result = subprocess.run([sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    # IPython warns, if another environment than that of this Python is active in the shell.
+    env = {k: v for k, v in os.environ.items() if k != "VIRTUAL_ENV"}
+    command = [sys.executable, script.name]
+    result = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=240)
     assert result.returncode == 0, result.stderr[-3000:]
 
 
