@@ -97,7 +97,7 @@ def _of_scene_file(path: Path, define: Mapping[str, str]) -> str:
 
 
 def _of_scene(scene: mi.Scene) -> str:
-    """Of all of its parameters, in the order of their names: Mitsuba, which loads in parallel, has them in any order."""
+    """Of all of its parameters, by name: Mitsuba, which loads in parallel, has them in any order."""
     digest = hashlib.blake2b(digest_size=16)
     for name, value in sorted(mi.traverse(scene).items(), key=lambda item: item[0]):
         value = value.matrix if is_transform(value) else value
