@@ -7,7 +7,7 @@ from .boundaries.indirect_shadows import IndirectShadows
 from .boundaries.shading_boundary import ShadingBoundary
 from .boundaries.shadow_boundary import ShadowBoundary, ShadowSamples
 from .choice.edge_tree import EdgeTree
-from .choice.sampling import EdgeSample, resample, sample_edge, stratified
+from .choice.sampling import EdgeSample, Reservoir, sample_edge, stratified
 from .choice.silhouettes import Silhouettes
 from .choice.views import Cone, Lobe, View
 from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
@@ -40,6 +40,7 @@ __all__ = [
     "Lights",
     "Lobe",
     "Projection",
+    "Reservoir",
     "ShadingBoundary",
     "ShadowBoundary",
     "ShadowSamples",
@@ -54,7 +55,6 @@ __all__ = [
     "find_welded_edges",
     "jumping_textures",
     "objects_below",
-    "resample",
     "sample_edge",
     "stratified",
     "t_junctions",

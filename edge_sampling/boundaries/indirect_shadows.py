@@ -49,7 +49,9 @@ def share(
     lamp, among light samples and among those of the BSDF. cos : of the angle between it and the normal at x. near,
     whole : distances of the edge and of the lamp from x.
     """
-    from_lamp = light_pdf * cos * (whole - near) * dr.rsqrt(light_pdf + pdf) / (AROUND * dr.square(whole) * near)
+    # Not below 0 at the own edges of a lamp, whatever rounding does: both ways must find a part from 0 to 1.
+    beyond = dr.maximum(whole - near, 0)
+    from_lamp = light_pdf * cos * beyond * dr.rsqrt(light_pdf + pdf) / (AROUND * dr.square(whole) * near)
     part = from_lamp / (from_lamp + density)
     return dr.select(dr.isfinite(part) & dr.isfinite(density), part, 0)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -173,37 +172,6 @@ class Reservoir:
         """The one that is kept, of so many. Its `density` is what an unbiased estimate divides by, though no
         density."""
         return EdgeSample(self.edge, self.t, dr.select(self.total > 0, self.target * count / self.total, 0))
-
-
-def resample(
-    draw: Callable[[mi.Float, mi.Sampler], EdgeSample],
-    target: Callable[[EdgeSample], mi.Float],
-    sampler: mi.Sampler,
-    count: int,
-    active: mi.Bool,
-) -> EdgeSample:
-    """Of a few samples keep one, see `Reservoir`: the more there are, the closer the density comes to `target`.
-
-    draw : makes the k-th sample.
-    target : of the density with respect to t; 0 only where the integrand is.
-
-    Returns
-    -------
-    EdgeSample, (N,), see `Reservoir.kept`.
-    """
-
-    def step(k, reservoir, sampler):
-        e = draw(k, sampler)
-        return k + 1, reservoir.take(e, target(e), sampler, active)[0], sampler
-
-    width = dr.width(active)
-    _, reservoir, _ = dr.while_loop(
-        (dr.zeros(mi.Float, width), dr.zeros(Reservoir, width), sampler),
-        lambda k, *_: active & (k < count),
-        step,
-        label="candidates",
-    )
-    return reservoir.kept(count)
 
 
 def _renewed(choice: mi.Float, density: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:

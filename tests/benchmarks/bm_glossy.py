@@ -43,7 +43,7 @@ from _bench import (
 
 from rimlight.edge_sampling import Geometry, find_edges
 from rimlight.edge_sampling.choice.edge_tree import EdgeTree
-from rimlight.edge_sampling.choice.sampling import EdgeSample, resample, sample_edge
+from rimlight.edge_sampling.choice.sampling import EdgeSample, Reservoir, sample_edge
 from rimlight.edge_sampling.choice.views import Lobe, View
 
 OURS, PEER = "direct_edge", "direct_projective"
@@ -203,7 +203,11 @@ def _weights(
         a, b = tree.device_edges.end_points(positions, e.edge)
         return dr.norm(b - a) / dr.norm(dr.lerp(a, b, e.t) - eye)
 
-    e = draw(0, sampler) if candidates == 1 else resample(draw, length_by_distance, sampler, candidates, active)
+    reservoir = dr.zeros(Reservoir, count)
+    for k in range(candidates):
+        e = draw(k, sampler)
+        reservoir, _ = reservoir.take(e, length_by_distance(e), sampler, active)
+    e = reservoir.kept(candidates)
     hit = (e.density > 0) & tree.device_edges.is_boundary(positions, e.edge, eye)
     return np.array(dr.select(hit, length_by_distance(e) / e.density, 0), float)
 

@@ -14,7 +14,7 @@ from scipy.stats import chisquare
 
 from rimlight.edge_sampling import Edges, Geometry, find_edges
 from rimlight.edge_sampling.choice.edge_tree import LEAF, EdgeTree
-from rimlight.edge_sampling.choice.sampling import resample, sample_edge
+from rimlight.edge_sampling.choice.sampling import Reservoir, sample_edge
 from rimlight.edge_sampling.choice.views import Cone, Lobe, View
 
 # ---------------------- Meshes and trees ----------------------
@@ -268,7 +268,11 @@ def draw(
         return dr.norm(b - a) / dr.norm(dr.lerp(a, b, e.t) - setup.tree.centre - view.p)
 
     active = dr.full(mi.Bool, True, count)
-    e = sample(0, sampler) if candidates == 1 else resample(sample, length_by_distance, sampler, candidates, active)
+    reservoir = dr.zeros(Reservoir, count)
+    for k in range(candidates):
+        e = sample(k, sampler)
+        reservoir, _ = reservoir.take(e, length_by_distance(e), sampler, active)
+    e = reservoir.kept(candidates)
     dr.eval(e)
     return np.array(e.edge), np.array(e.t, float), np.array(e.density, float)
 
