@@ -119,7 +119,7 @@ class DeviceEdges:
         for ray, si in zip(rays, met, strict=True):
             through = self._lets_through(si)
             slack = rounding(p, ray.o)
-            passed = [passes(ray, [a, b, o]) for o in self.opposite(positions, edge)]
+            passed = [passes(ray, p, [a, b, o]) for o in self.opposite(positions, edge)]
             there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
             covers.append(passed[0] & passed[1])
             shown.append((passed[0] & there[0]) | (passed[1] & there[1]))
@@ -276,9 +276,13 @@ def line_of_sight(p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]) -> mi.Vector3f
     return p - dr.lerp(rays[0].o, rays[1].o, 0.5)
 
 
-def passes(ray: mi.Ray3f, corners: list[mi.Point3f]) -> mi.Bool:
-    """Does the line of a ray pass through a triangle?"""
-    corners = [c - ray.o for c in corners]
+def passes(ray: mi.Ray3f, p: mi.Point3f, corners: list[mi.Point3f]) -> mi.Bool:
+    """Does the line of a ray, which passes close by a point p, pass through a triangle around p?
+
+    Seen from the ray's origin, the corners of a fine triangle are all in one direction, up to rounding.
+    """
+    nearest = dr.fma(ray.d, dr.dot(ray.d, p - ray.o), ray.o)
+    corners = [c - nearest for c in corners]
     turns = [dr.dot(ray.d, dr.cross(corners[i], corners[i - 1])) for i in range(3)]
     front = (dr.minimum(*turns[:2]) > 0) & (turns[2] > 0)
     return front | ((dr.maximum(*turns[:2]) < 0) & (turns[2] < 0))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rimlight.edge_sampling import EdgeKind, Geometry, find_edges
+from rimlight.edge_sampling.geometry.device_edges import passes
 
 
 def edges_of(*meshes):
@@ -106,3 +107,22 @@ def test_a_million_triangles():
     edges = edges_of(sheet)
     print(f"{len(faces)} triangles: {time.perf_counter() - start:.2f} s")
     assert len(edges) == 3 * 707**2 + 2 * 707
+
+
+@pytest.mark.parametrize("distance", [1.0, 100.0])
+def test_rays_pass_through_fine_faces_or_past_them(distance):
+    """However far away they start: single precision loses 10⁻⁷ of the distance, not of its square."""
+    random = np.random.default_rng(1)
+    n, size, aside = 1000, 5e-3 * distance, 4e-7 * distance
+    a, b, c = (size * random.normal(size=(3, n)) for _ in range(3))
+    d = random.normal(size=(3, n))
+    d /= np.linalg.norm(d, axis=0)
+    across = np.cross(b - a, d, axis=0)
+    across *= np.sign(((c - a) * across).sum(0)) / np.linalg.norm(across, axis=0)
+    p = a + random.uniform(0.1, 0.9, n) * (b - a)
+    wide = ((c - p) * across).sum(0) > 20 * aside
+    for sign in (1, -1):
+        ray = mi.Ray3f(mi.Point3f(p + sign * aside * across - distance * d), mi.Vector3f(d))
+        through = np.array(passes(ray, mi.Point3f(p), [mi.Point3f(x) for x in (a, b, c)]))
+        assert wide.sum() > n / 2
+        assert (through[wide] == (sign > 0)).all()
