@@ -172,9 +172,8 @@ class ShadingBoundary:
                 arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
                 seen_past = outline.outward(dr.cross(d, outline.tangent), d) != 0
                 crease = self.silhouettes.crease(e, outline) * (1 - vicinity.far(r2))
-                # The closer an edge is, the faster its direction turns: this matters most in the vicinity.
-                turn = dr.select(vicinity.radius > 0, dr.rcp(dr.minimum(dr.sqrt(r2), vicinity.radius)), 1)
-                turn *= self.silhouettes.preferred(e, use)
+                # The closer an edge is, the faster its direction turns.
+                turn = dr.rsqrt(r2) * self.silhouettes.preferred(e, use)
                 return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
 
             e, emission = _chosen(candidate, choice, emission, scattering, sampler)
