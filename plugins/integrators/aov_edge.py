@@ -135,6 +135,7 @@ class AOVEdgeIntegrator(EdgeIntegrator):
     IDLE = ("sppi",)
     TRACER = ChannelTracer
     TERMS = (ChannelsTerm(), ChannelsOnFilmTerm())
+    BALANCES = False
 
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from rimlight._collection import no_collection
@@ -13,10 +16,11 @@ from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.order import TERMS
 from rimlight.terms.sampling import Counts
-from rimlight.terms.term import FilmSamples, Job, Sample, Term
+from rimlight.terms.term import FilmSamples, Job, Sample, Term, forward
 from rimlight.transport.paths import Depths
 from rimlight.transport.tracer import PathTracer
 
+from ._balance import RUNS, Balance, balanced
 from ._finite import report_gradients, report_image, values_of
 from ._options import check_options, is_whole
 from ._search import BoundarySearch
@@ -51,6 +55,9 @@ class EdgeIntegrator(ADIntegrator):
     #: Does it have boundaries as shading points see them?
     FROM_POINTS = True
 
+    #: Can samples be divided among its terms, see `balance`?
+    BALANCES = True
+
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
         if "sample" in vars(cls):
@@ -69,6 +76,8 @@ class EdgeIntegrator(ADIntegrator):
             raise InputError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         self.search = BoundarySearch(self.name, self.depths, planes=self.PLANES, from_points=self.FROM_POINTS)
+        #: By what the samples of a term are multiplied, by its name; empty: all have as many. See `balance`.
+        self.shares: dict[str, float] = {}
         self._warned: set[str] = set()
 
     def _sample_count(self, props: mi.Properties, key: str) -> int | None:
@@ -96,24 +105,14 @@ class EdgeIntegrator(ADIntegrator):
         -------
         mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
         """
-        if params is not None and not any(dr.grad_enabled(v) for v in values_of(params).values()):
-            raise Refusal(f"{self.name}: none of the parameters carries a gradient")
+        self._refuse_without_gradient(params)
         with dr.suspend_grad():
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Forward)
             job.boundaries.refit()
             terms, values = [], []
-            for make in (make for term in self.TERMS for make in term.samples(job)):
+            for make in (make for term in self.TERMS for make in term.samples(job.of(term))):
                 # One term after the other: path replay needs that nothing else is attached to the parameters.
-                term = make()
-                with dr.resume_grad():
-                    # A parameter that carries a gradient may well not show in the image: then the derivative is zero.
-                    start = term.replay.start if term.replay is not None else mi.Float(0)
-                    value, start = dr.forward_to(
-                        [term.value, start], flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-                    )
-                term = term.detached()
-                if term.replay is not None:
-                    value.L += term.throughput * term.replay.forward(start)
+                term, value = forward(make)
                 terms.append(term)
                 values.append(value)
             image = self._develop(job.sensor.film(), terms, values)
@@ -128,7 +127,7 @@ class EdgeIntegrator(ADIntegrator):
         with dr.isolate_grad(), dr.suspend_grad():
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Backward)
             job.boundaries.refit()
-            terms = [make() for term in self.TERMS for make in term.samples(job)]
+            terms = [make() for term in self.TERMS for make in term.samples(job.of(term))]
             with dr.resume_grad():
                 # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
                 # is traced for it.
@@ -189,6 +188,10 @@ class EdgeIntegrator(ADIntegrator):
         found = self.TRACER(scene, self).radiance(ray, sampler, mi.Bool(active), attached=mode != dr.ADMode.Primal)
         return found.L, found.valid, [], found.rest
 
+    def _refuse_without_gradient(self, params) -> None:
+        if params is not None and not any(dr.grad_enabled(v) for v in values_of(params).values()):
+            raise Refusal(f"{self.name}: none of the parameters carries a gradient")
+
     def _refuse_to_be_differentiated(self, scene: mi.Scene) -> None:
         probe = mi.Float(0)
         dr.enable_grad(probe)
@@ -216,7 +219,7 @@ class EdgeIntegrator(ADIntegrator):
         tracer = self.TRACER(scene, self)
         tracer.glass, tracer.lights = boundaries.glass, boundaries.lights
         tracer.fine_mirrors = boundaries.fine_mirrors
-        return Job(tracer, sensor, boundaries, counts, rays, seed, mode)
+        return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.shares)
 
     @no_collection()
     def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:
@@ -232,9 +235,58 @@ class EdgeIntegrator(ADIntegrator):
             lights_move=found.lights_move,
             edges=len(search.edges),
             tree=found.silhouettes.leaves if found.silhouettes is not None else 0,
-            terms=tuple(term.planned(job) for term in self.TERMS),
+            terms=tuple(term.planned(job.of(term)) for term in self.TERMS),
             limits=found.limits,
         )
+
+    @no_collection()
+    def balance(
+        self, scene: mi.Scene, params: Any = None, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 16
+    ) -> Balance:
+        """Divide samples among the terms so that derivatives like this one have the least error in a given time.
+
+        The noise of each term is measured along the gradients that are set on the parameters, as `render_forward` has
+        them: `RUNS` derivatives with `spp` samples per pixel. From then on, in derivatives forward and backward, each
+        term takes its share of the samples per pixel that are asked for, at least one. What a number of samples was
+        given for in the scene file ("sppc", "sppp", "sppi") keeps that. Estimates stay without bias whatever the
+        shares. Frozen functions that were recorded before keep the shares of that time.
+
+        Returns
+        -------
+        What was measured; `integrator.shares` has the shares, which may be kept, and set again.
+
+        Raises
+        ------
+        RuntimeError : none of the parameters carries a gradient, or `dr.freeze` records.
+        """
+        if not self.BALANCES:
+            raise Refusal(f"{self.name} does not divide its samples; direct_edge or prb_edge does")
+        self._refuse_without_gradient(params)
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise Refusal(f"{self.name}: a frozen function cannot measure noise: call `balance` before it")
+        self.shares = {}
+        with dr.suspend_grad():
+            jobs = [self.job(scene, sensor, seed + run, spp, dr.ADMode.Forward) for run in range(RUNS)]
+            images = [self._images_of_terms(job) for job in jobs]
+            plans = {term.name: term.planned(jobs[0]) for term in self.TERMS}
+        cost = {term.name: term.effort * plans[term.name].samples * plans[term.name].rays for term in self.TERMS}
+        fixed = {term.name for term in self.TERMS if getattr(self, term.of_property)}
+        found = balanced({name: np.array([image[name] for image in images]) for name in cost}, cost, fixed)
+        self.shares = found.shares
+        return found
+
+    def _images_of_terms(self, job: Job) -> dict[str, np.ndarray]:
+        """The derivative that each term makes of the image."""
+        job.boundaries.refit()
+        images, weighing = {}, []
+        for term in self.TERMS:
+            made = weighing + [forward(make) for make in term.samples(job)]
+            if not weighing:
+                # By the weights of the interior's samples the film divides all.
+                (samples, value) = made[0]
+                weighing = [(samples, value.zeros(dr.width(samples.position)))]
+            images[term.name] = np.array(self._develop(job.sensor.film(), *zip(*made, strict=True)), np.float64)
+        return images
 
     @no_collection()
     def find_boundaries(self, scene, sensor=0) -> Boundaries:

@@ -114,6 +114,7 @@ class RigIntegrator(EdgeIntegrator):
     OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth", "lights_per_path")
     PLANES = False
     FROM_POINTS = False
+    BALANCES = False
 
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()

@@ -56,7 +56,7 @@ RAYS = 2 * (3 * CANDIDATES + 11)
 class BisectionTerm(Term):
     """Outlines of what the camera sees in mirrors, and through glass, and lines at which textures jump."""
 
-    name = "mirrors and textures"
+    name, of_property = "mirrors and textures", "sppp"
 
     def planned(self, job: Job) -> PlannedTerm:
         count = sum(job.counts.on_line(part.sensor.film()) for part in job.parts) if self._wanted(job) else 0

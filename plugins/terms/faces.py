@@ -16,7 +16,7 @@ from .term import Job
 class FacePlanesTerm(FromPoints):
     """What faces hide from themselves, where other normals than theirs shade."""
 
-    name = "planes of faces"
+    name, effort = "planes of faces", 3.0
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0

@@ -18,7 +18,7 @@ from .term import FilmSamples, Job, Sample, Term
 class FilmTerm(Term):
     """Edges that move over the film, on each of its parts."""
 
-    name = "film boundary"
+    name, of_property = "film boundary", "sppp"
 
     def planned(self, job: Job) -> PlannedTerm:
         film, sppp = job.boundaries.film, job.counts.film

@@ -16,7 +16,7 @@ from .term import Job
 class IndirectShadowsTerm(FromPoints):
     """Edges as the lights see them, by the shadows on what lights the vertices of paths."""
 
-    name = "shadows in indirect light"
+    name, effort = "shadows in indirect light", 3.0
 
     def planned(self, job: Job) -> PlannedTerm:
         lights = len(self.boundary(job)) if self.boundary(job) is not None else 0

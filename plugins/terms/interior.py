@@ -11,13 +11,13 @@ from rimlight._plan import PlannedTerm
 from rimlight.transport.cut import Cut
 
 from .sampling import over_film
-from .term import FilmSamples, Job, Sample, Term
+from .term import INTERIOR, FilmSamples, Job, Sample, Term
 
 
 class InteriorTerm(Term):
     """Camera paths, as the image has them: their first vertex is attached, the rest is differentiated by replay."""
 
-    name = "interior"
+    name, of_property = INTERIOR, "sppc"
 
     def planned(self, job: Job) -> PlannedTerm:
         path = job.rays_of_path

@@ -55,7 +55,7 @@ class FromPoints(Term):
 class PointsTerm(FromPoints):
     """Edges that hide, from a vertex, light that it would reflect."""
 
-    name = "edges from points"
+    name, effort = "edges from points", 4.0
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0

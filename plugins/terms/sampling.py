@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
@@ -43,6 +43,16 @@ class Counts:
         """
         count = lambda own: 0 if own == 0 else spp or own or sensor.sampler().sample_count()
         return Counts(count(sppc), count(sppp), count(sppi), bool(sppp))
+
+    def shared(self, interior: float, term: float) -> Counts:
+        """Those of one term: its share of samples, and that of the interior, which the film's weights follow."""
+        times = lambda count, share: count and max(1, round(count * share))
+        return replace(
+            self,
+            interior=times(self.interior, interior),
+            film=times(self.film, term),
+            shading=times(self.shading, term),
+        )
 
     def on_line(self, film: mi.Film) -> int:
         """Samples of the film boundary in all. A line covers few pixels: unless a number of samples was asked for, so

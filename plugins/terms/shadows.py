@@ -18,7 +18,7 @@ from .term import FilmSamples, Job, Sample, Term
 class ShadowsTerm(Term):
     """Edges as the lights see them, on each part of the film."""
 
-    name = "shadows from lights"
+    name, effort = "shadows from lights", 3.0
 
     def planned(self, job: Job) -> PlannedTerm:
         shadows, shading = job.boundaries.shadows, job.boundaries.shading

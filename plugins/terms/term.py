@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +19,9 @@ from rimlight.transport.replay import ChosenVertex, Replay
 from rimlight.transport.tracer import PathTracer
 
 from .sampling import Counts, per_pixel, size
+
+#: Name of the term whose samples are those of the image.
+INTERIOR = "interior"
 
 #: Longest path that a plan counts rays of.
 LONG = 16
@@ -61,11 +64,26 @@ class FilmSamples:
         return replace(self, value=dr.detach(self.value))
 
 
+def forward(make: Callable[[], FilmSamples]) -> tuple[FilmSamples, Sample]:
+    """Film samples of a term, detached, and their derivatives along the gradients that are set on the parameters."""
+    samples = make()
+    with dr.resume_grad():
+        # A parameter that carries a gradient may well not show in the image: then the derivative is zero.
+        start = samples.replay.start if samples.replay is not None else mi.Float(0)
+        flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+        value, start = dr.forward_to([samples.value, start], flags=flags)
+    samples = samples.detached()
+    if samples.replay is not None:
+        value.L += samples.throughput * samples.replay.forward(start)
+    return samples, value
+
+
 @dataclass(frozen=True)
 class Job:
     """One derivative: of what, as seen from where, along which boundaries, with how many samples.
 
     sample_rays : maps a sampler to camera rays, their weights, and film positions in pixels.
+    shares : by what the samples of a term are multiplied, by its name; 1 if it is not there.
     """
 
     tracer: PathTracer
@@ -75,6 +93,14 @@ class Job:
     sample_rays: Callable[[mi.Sampler], tuple[Any, Any, Any]]
     seed: int | mi.UInt32 = 0
     mode: dr.ADMode = dr.ADMode.Primal
+    shares: dict[str, float] = field(default_factory=dict)
+
+    def of(self, term: Term) -> Job:
+        """What one term is to do of it."""
+        if not self.shares:
+            return self
+        interior, own = (self.shares.get(name, 1.0) for name in (INTERIOR, term.name))
+        return replace(self, counts=self.counts.shared(interior, own))
 
     @cached_property
     def parts(self) -> list[FilmPart]:
@@ -109,9 +135,13 @@ class Term(ABC):
     """A term of the derivative.
 
     name : what it is, in plans; its seed goes by it.
+    of_property : the property of an integrator that fixes its number of samples.
+    effort : about how long one of its rays takes, choice of edges included, relative to one of the interior.
     """
 
     name: str
+    of_property: str = "sppi"
+    effort: float = 1.0
 
     @abstractmethod
     def planned(self, job: Job) -> PlannedTerm:
