@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rooms
 
+from rimlight import scenes
 from rimlight.checks import mean_and_error, z_scores
 from rimlight.integrators._light_image import LightImage
 from rimlight.transport.subpath_weights import Shorter, weight
@@ -394,3 +395,19 @@ def test_spectral_variants_are_refused(variant):
             mi.load_dict({"type": "bdpt"})
     finally:
         mi.set_variant(variant)
+
+
+# ---------------------- Scenes of the test suite ----------------------
+
+
+@pytest.mark.parametrize("case", [c for c in cases.CASES if c.needs is None], ids=lambda c: c.name)
+def test_scenes_of_derivatives(variant, case):
+    """Beside mirrors and lights without size, and where lamps are coarse, `path` has other images: see below."""
+    scene = (case.reference_scene or case.scene)()
+    assert_equals_path(scene, spp=16, max_depth=max(case.max_depth, 3))
+
+
+@pytest.mark.parametrize("name", scenes.names())
+def test_shipped_scenes(variant, name):
+    scene = mi.load_file(str(scenes.path(name)), res=16)
+    assert_equals_path(scene, max_depth=scene.integrator().depths.max_depth)
