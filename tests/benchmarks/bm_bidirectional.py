@@ -103,7 +103,7 @@ def report(found: dict[str, Any]) -> list[str]:
     }
     for title, names in (("Light that is hard to find:", HARD), ("In the open:", OPEN)):
         rows = [found[name] for name in names if name in found]
-        lines += ["", title, "", *table(columns, rows)] if rows else []
+        lines += [title, *table(columns, rows)] if rows else []
     return lines
 
 
