@@ -39,6 +39,7 @@ test_aov_edge.py::test_frozen_is_unfrozen[lit-sensor.to_world]
 test_aov_edge.py::test_other_variants[llvm_ad_mono]
 test_batch.py::test_forward_and_backward_agree[direct_edge-cube
 test_batch.py::test_forward_and_backward_agree[prb_edge
+test_bdpt.py::test_advice[door_ajar
 test_bdpt.py::test_caustics_of_lights_without_size[led
 test_bdpt.py::test_caustics_of_lights_without_size[spot
 test_bdpt.py::test_filters[False-lanczos

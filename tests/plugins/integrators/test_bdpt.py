@@ -10,7 +10,9 @@ import pytest
 import rooms
 
 from rimlight import scenes
+from rimlight._image_advice import ImageAdvice, image_advice
 from rimlight.checks import mean_and_error, z_scores
+from rimlight.cli import main
 from rimlight.integrators._light_image import LightImage
 from rimlight.transport.subpath_weights import Shorter, weight
 
@@ -416,3 +418,31 @@ def test_shipped_scenes(variant, name):
     scene = mi.load_file(str(scenes.path(name)), res=16)
     kind = "ptracer" if name in RARE else "path"
     assert_equals_path(scene, spp=256 if name in RARE else 64, kind=kind, max_depth=scene.integrator().depths.max_depth)
+
+
+# ---------------------- Where it pays ----------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("glossy_caustic", "bdpt"), ("door_ajar", "bdpt"), ("lit_room", "path")]
+)
+def test_advice(variant, name, expected):
+    scene = mi.load_file(str(scenes.path(name)), res=32)
+    advice = image_advice(scene, max_depth=scene.integrator().depths.max_depth)
+    assert advice.integrator == expected
+    assert str(advice).startswith(f"images: {expected}")
+    assert (advice.share > 0.05) == (expected == "bdpt")
+
+
+def test_advice_on_what_is_not_supported(variant):
+    fog = {"type": "cube", "interior": {"type": "homogeneous"}, "bsdf": {"type": "null"}}
+    with pytest.raises(RuntimeError, match="participating media are not supported"):
+        image_advice(room(fog=fog))
+
+
+def test_plan_gives_advice(variant, capsys):
+    arguments = ["plan", str(scenes.path("shadow_blocker")), "--integrator", "direct_edge", "-D", "res=16"]
+    assert main([*arguments, "--images"]) == 0
+    with_advice = capsys.readouterr().out
+    assert main(arguments) == 0
+    assert with_advice == capsys.readouterr().out + f"{ImageAdvice('path', 0.0)}\n"
