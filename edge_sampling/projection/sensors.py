@@ -174,6 +174,11 @@ class PlanarProjection(Projection):
         self.aperture_radius = params["aperture_radius"] if kind == SENSORS["thinlens"] else None
         self.focus_distance = sensor.focus_distance()
         self.near, self.far = sensor.near_clip(), sensor.far_clip()
+        # Pixels per unit across the line of sight, at a depth of 1. Detached. An orthographic sensor is as large as its
+        # transformation makes it, across but not along the view.
+        to_sample, to_local = dr.detach(self.to_sample), dr.detach(self.to_local).matrix
+        rows = [dr.norm(mi.Vector3f([to_local[i, k] for k in range(3)])) if self.orthographic else 1 for i in (0, 1)]
+        self.scales = [dr.abs(to_sample[i, i]) * self.crop_size[i] * rows[i] for i in (0, 1)]
         self.attached = dr.grad_enabled(
             self.to_world, self.to_sample, self.principal_point, self.aperture_radius, self.focus_distance
         )  # fmt: skip
@@ -230,7 +235,7 @@ class PlanarProjection(Projection):
         return scale * self.lens_radius() * dr.abs(point.z / dr.detach(self.focus_distance) - 1)
 
     def pixels_per_area(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
-        x, y = self._scales()
+        x, y = self.scales
         if self.orthographic:
             return x * y
         # Those of a plane at depth 1, at distance r under the angle θ: cos θ / r² · 1 / cos⁴ θ, with depth r cos θ. See
@@ -251,17 +256,7 @@ class PlanarProjection(Projection):
         return dr.maximum(-dr.dot(d, self.view()), 1e-6)
 
     def pixels_per_unit(self, point: FilmPoint) -> mi.Float:
-        return dr.maximum(*self._scales()) / dr.abs(point.w)
-
-    def _scales(self) -> list[mi.Float]:
-        """Pixels per unit across the line of sight, at a depth of 1."""
-        to_sample, to_local = dr.detach(self.to_sample), dr.detach(self.to_local).matrix
-        scales = []
-        for i in (0, 1):
-            # An orthographic sensor is as large as its transformation makes it, across but not along the view.
-            row = dr.norm(mi.Vector3f([to_local[i, k] for k in range(3)])) if self.orthographic else 1
-            scales.append(dr.abs(to_sample[i, i]) * self.crop_size[i] * row)
-        return scales
+        return dr.maximum(*self.scales) / dr.abs(point.w)
 
 
 @dataclass(frozen=True)

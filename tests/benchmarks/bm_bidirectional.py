@@ -20,6 +20,7 @@ from rimlight import scenes
 RES, SPP = 128, 64
 WAYS, EXPOSURE = "glossy_caustic", 4.0
 HARD = ("lampshade", "door_ajar", "glossy_caustic")
+PAIR_EXPOSURE = {"lampshade": 4.0, "door_ajar": 8.0, "glossy_caustic": 2.0}
 OPEN = ("lit_room", "objects", "shadow_blocker")
 
 
@@ -53,9 +54,22 @@ def measure(name: str, settings: Settings, folder: Path) -> dict[str, Any]:
             "error": float(np.std([i.mean() for i in images[kind]], ddof=1) / np.sqrt(len(images[kind]))),
         }
     say(str(row))
+    if name in HARD:
+        draw_pair(scene, name, depth, folder)
     if name == WAYS:
         draw_ways(scene, depth, folder, settings)
     return row
+
+
+def draw_pair(scene: mi.Scene, name: str, depth: int, folder: Path) -> None:
+    """Images of both at about equal time."""
+    made, row = figure(2, 2.6, 2.9)
+    for axes, kind, spp in zip(row, ("path", "bdpt"), (2 * SPP, SPP), strict=True):
+        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": kind, "max_depth": depth}), spp=spp))
+        axes.imshow(np.clip(image * PAIR_EXPOSURE[name], 0, 1) ** (1 / 2.2))
+        axes.set_title(f"{kind}, {spp} samples per pixel", fontsize=8)
+        axes.axis("off")
+    save(made, folder / f"bidirectional_{name}.png")
 
 
 def draw_ways(scene: mi.Scene, depth: int, folder: Path, settings: Settings) -> None:
