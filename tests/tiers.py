@@ -39,6 +39,45 @@ test_aov_edge.py::test_frozen_is_unfrozen[lit-sensor.to_world]
 test_aov_edge.py::test_other_variants[llvm_ad_mono]
 test_batch.py::test_forward_and_backward_agree[direct_edge-cube
 test_batch.py::test_forward_and_backward_agree[prb_edge
+test_bdpt.py::test_advice[door_ajar
+test_bdpt.py::test_advice[lit_room
+test_bdpt.py::test_caustics_of_lights_without_size[led
+test_bdpt.py::test_caustics_of_lights_without_size[point
+test_bdpt.py::test_caustics_of_lights_without_size[spot
+test_bdpt.py::test_filters[False-lanczos
+test_bdpt.py::test_filters[False-mitchell
+test_bdpt.py::test_filters[False-tent
+test_bdpt.py::test_filters[True-lanczos
+test_bdpt.py::test_filters[True-mitchell
+test_bdpt.py::test_filters[True-tent
+test_bdpt.py::test_interpolated_normals
+test_bdpt.py::test_lights[constant
+test_bdpt.py::test_lights[cylinder
+test_bdpt.py::test_lights[disk
+test_bdpt.py::test_lights[led
+test_bdpt.py::test_lights[projector
+test_bdpt.py::test_lights[sphere
+test_bdpt.py::test_lights[spot
+test_bdpt.py::test_lights[sunsky
+test_bdpt.py::test_lights[texture
+test_bdpt.py::test_monochrome
+test_bdpt.py::test_normal_maps[metal
+test_bdpt.py::test_options[max_depth 0
+test_bdpt.py::test_options[max_depth 2
+test_bdpt.py::test_options[max_depth 3
+test_bdpt.py::test_options[max_depth 4 light_paths
+test_bdpt.py::test_scenes_of_derivatives
+test_bdpt.py::test_sensors[clipping
+test_bdpt.py::test_sensors[principal
+test_bdpt.py::test_shipped_scenes
+test_bdpt.py::test_surfaces[blend
+test_bdpt.py::test_surfaces[blinn_phong
+test_bdpt.py::test_surfaces[metal
+test_bdpt.py::test_surfaces[mirror
+test_bdpt.py::test_surfaces[plastic
+test_bdpt.py::test_surfaces[principled
+test_bdpt.py::test_surfaces[rough plastic
+test_bdpt.py::test_surfaces[thin glass
 test_blinn_phong.py::test_shadows_and_reflections_move
 test_blinn_phong.py::test_textures_in_a_render[diffuse_reflectance-direct_edge]
 test_blinn_phong.py::test_textures_in_a_render[roughness-prb_edge]

@@ -10,6 +10,8 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.refusals import Refusal
 
+from .sensors import inside_frame
+
 
 @dataclass(frozen=True)
 class FilmPart:
@@ -28,6 +30,10 @@ class FilmPart:
     def area(self) -> float:
         """Of one of its own pixels, in pixels of the film that is rendered."""
         return self.scale.x * self.scale.y
+
+    def inside(self, u: mi.Point2f) -> mi.Bool:
+        """Is a position on its own film on it, or where it is sampled around it?"""
+        return inside_frame(u, self.sensor.film())
 
     def to_film(self, u: mi.Point2f) -> mi.Point2f:
         """A position on its own film, on the film that is rendered; pixels."""

@@ -109,6 +109,19 @@ class Projection(ABC):
         """What is visible of the edge from a to b: all that is in the frame, and possibly more. Detached."""
 
     @abstractmethod
+    def pixels_per_area(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """Area on the film, in pixels, of a small surface at p, over its area across the line of sight: mi.Float, (N,).
+        Detached.
+
+        d : mi.Vector3f, (N,), unit length, from p towards the point of the lens that sees it.
+        """
+
+    @abstractmethod
+    def distance(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """From p along d to where the sensor's ray to it starts: mi.Float, (N,), scene units, negative where none can
+        reach it. Detached."""
+
+    @abstractmethod
     def pixels_per_unit(self, point: FilmPoint) -> mi.Float:
         """How many pixels a short length across the line of sight covers. Detached."""
 
@@ -161,6 +174,11 @@ class PlanarProjection(Projection):
         self.aperture_radius = params["aperture_radius"] if kind == SENSORS["thinlens"] else None
         self.focus_distance = sensor.focus_distance()
         self.near, self.far = sensor.near_clip(), sensor.far_clip()
+        # Pixels per unit across the line of sight, at a depth of 1. Detached. An orthographic sensor is as large as its
+        # transformation makes it, across but not along the view.
+        to_sample, to_local = dr.detach(self.to_sample), dr.detach(self.to_local).matrix
+        rows = [dr.norm(mi.Vector3f([to_local[i, k] for k in range(3)])) if self.orthographic else 1 for i in (0, 1)]
+        self.scales = [dr.abs(to_sample[i, i]) * self.crop_size[i] * rows[i] for i in (0, 1)]
         self.attached = dr.grad_enabled(
             self.to_world, self.to_sample, self.principal_point, self.aperture_radius, self.focus_distance
         )  # fmt: skip
@@ -216,14 +234,29 @@ class PlanarProjection(Projection):
         scale = dr.abs(dr.detach(self.to_sample)[0, 0]) * self.crop_size.x
         return scale * self.lens_radius() * dr.abs(point.z / dr.detach(self.focus_distance) - 1)
 
+    def pixels_per_area(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        x, y = self.scales
+        if self.orthographic:
+            return x * y
+        # Those of a plane at depth 1, at distance r under the angle θ: cos θ / r² · 1 / cos⁴ θ, with depth r cos θ. See
+        # `importance` of Mitsuba's `perspective`.
+        return x * y / (dr.square(self._depth(p)) * self._cosine(d))
+
+    def distance(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        # Planes are in units of an orthographic sensor, which its transformation may stretch; rays end in the world's.
+        row = mi.Vector3f([dr.detach(self.to_local).matrix[2, k] for k in range(3)])
+        beyond_near = (self._depth(p) - self.near) / dr.norm(row)
+        return dr.select(beyond_near > self.far - self.near, -1, beyond_near / self._cosine(d))
+
+    def _depth(self, p: mi.Point3f) -> mi.Float:
+        return (dr.detach(self.to_local) @ p).z
+
+    def _cosine(self, d: mi.Vector3f) -> mi.Float:
+        """Of the angle between a line of sight and the optical axis."""
+        return dr.maximum(-dr.dot(d, self.view()), 1e-6)
+
     def pixels_per_unit(self, point: FilmPoint) -> mi.Float:
-        to_sample, to_local = dr.detach(self.to_sample), dr.detach(self.to_local).matrix
-        scales = []
-        for i in (0, 1):
-            # An orthographic sensor is as large as its transformation makes it, across but not along the view.
-            row = dr.norm(mi.Vector3f([to_local[i, k] for k in range(3)])) if self.orthographic else 1
-            scales.append(dr.abs(to_sample[i, i]) * self.crop_size[i] * row)
-        return dr.maximum(*scales) / dr.abs(point.w)
+        return dr.maximum(*self.scales) / dr.abs(point.w)
 
 
 @dataclass(frozen=True)
@@ -281,6 +314,17 @@ class FisheyeProjection(Projection):
         lower, upper = map(mi.ScalarVector2f, self.frame)
         middle = from_equidistant((0.5 * (lower + upper) - self.centre) / scale)
         return arc.clipped(middle, 0.5 * dr.norm(upper - lower) / scale)
+
+    def pixels_per_area(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        # θ dθ dφ on the film for sin θ dθ dφ.
+        q = mi.Vector3f(dr.detach(self.to_local) @ p)
+        θ = dr.maximum(dr.norm(equidistant(q)), 1e-6)
+        inside = θ * dr.detach(self.scale) <= self.radius
+        density = dr.square(dr.detach(self.scale)) * (θ / dr.sin(θ)) / dr.squared_norm(q)
+        return dr.select(inside, density, 0)
+
+    def distance(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        return dr.norm(mi.Vector3f(dr.detach(self.to_local) @ p))
 
     def pixels_per_unit(self, point: FilmPoint) -> mi.Float:
         scale = dr.detach(self.scale)

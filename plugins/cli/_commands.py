@@ -14,6 +14,7 @@ from tyro.conf import UseAppendAction, arg
 
 import rimlight
 from rimlight import pictures
+from rimlight._image_advice import image_advice
 from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
 from rimlight.edge_sampling.geometry.meshes import is_positions_key
 from rimlight.exr import write_exr
@@ -60,6 +61,8 @@ class PlanCommand(OnSensor):
     """Integrator that renders: direct_edge or prb_edge."""
     spp: int = 16
     """Samples per pixel."""
+    images: bool = False
+    """Say also which integrator suits images of the scene: bdpt or path. Takes some seconds."""
 
     def run(self) -> int:
         at_least(1, spp=self.spp)
@@ -73,6 +76,9 @@ class PlanCommand(OnSensor):
             if is_positions_key(key) or key == _loading.camera_key(scene, self.sensor)
         ]
         print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
+        if self.images:
+            longest = integrator.depths.max_depth
+            print(image_advice(scene, sensor=self.sensor, max_depth=longest if longest < 0xFFFFFFFF else -1))
         return 0
 
 

@@ -36,6 +36,32 @@ def test_inverts_sample_ray(options, film):
     assert np.abs(np.array(u - expected)).max() < 2e-3
 
 
+@pytest.mark.parametrize("film", [{}, CROP], ids=["whole", "crop"])
+@pytest.mark.parametrize("options", [*SENSORS.values(), {"kind": "orthographic", "near_clip": 0.5}])
+def test_distance_and_density_of_rays(options, film):
+    """Of points that the sensor's rays meet: how far they are along the ray, and how large a square around them is."""
+    sensor = mi.load_dict(cases.camera(film={**cases.film(), **film}, **options))
+    rng = mi.PCG32(size=1000)
+    sample = 0.05 + 0.9 * mi.Point2f(rng.next_float32(), rng.next_float32())
+    lens = mi.Point2f(rng.next_float32(), rng.next_float32())
+    ray, weight = sensor.sample_ray(0.0, 0.5, sample, lens)
+    t = 1 + 5 * rng.next_float32()
+    p, projection = ray(t), Projection(sensor)
+    sees = np.array(weight.x + dr.zeros(mi.Float, 1000)) > 0
+    np.testing.assert_allclose(np.array(projection.distance(p, -ray.d))[sees], np.array(t)[sees], rtol=2e-3)
+    far = projection.distance(ray(2 * projection.far if np.isfinite(projection.far) else t), -ray.d)
+    assert (np.array(far)[sees] < 0).all() or not np.isfinite(projection.far)
+    h, frame = 1e-2 * t, mi.Frame3f(ray.d)
+    at = lambda offset: projection.film(mi.Point3f(p + offset), lens).position()
+    x, y = ((at(h * s) - at(-h * s)) / (2 * h) for s in (frame.s, frame.t))
+    area = dr.abs(x.x * y.y - x.y * y.x)
+    on_axis = np.array(dr.norm(x)) > 50 * np.array(dr.norm(y))  # behind a fisheye, differences are no derivatives
+    good = sees & ~on_axis & (np.array(area) < 1e5)
+    assert good.sum() > 400
+    found = np.array(projection.pixels_per_area(p, -ray.d) + dr.zeros(mi.Float, 1000))
+    np.testing.assert_allclose(found[good], np.array(area)[good], rtol=2e-2)
+
+
 LENS = {"kind": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0}
 PARAMETERS = [(LENS, key) for key in ("x_fov", "to_world", "aperture_radius", "focus_distance")]
 PARAMETERS += [({"kind": "fisheye"}, key) for key in ("fov", "to_world")]

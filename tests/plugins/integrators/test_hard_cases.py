@@ -200,6 +200,12 @@ def test_image_and_derivatives_are_finite(hard, integrator):
     assert_finite(hard, integrator())
 
 
+@pytest.mark.parametrize("hard", HARD.values(), ids=HARD)
+def test_images_from_both_ends_are_finite(hard):
+    image = np.array(mi.render(hard.scene(), integrator=mi.load_dict({"type": "bdpt", "max_depth": 5}), spp=SPP))
+    assert np.isfinite(image).all()
+
+
 def test_camera_that_moves_past_hard_meshes():
     """In forward mode: `test_direct_edge.py` has more of this."""
     scene = hard_meshes()
@@ -276,6 +282,17 @@ def test_closed_room_looks_the_same_from_everywhere():
     scene, motion = glowing_room(normals=False)
     integrator = mi.load_dict(INTEGRATORS["prb_edge"])
     assert_zero(np.array([jacobian_times(scene, integrator, motion, seed=i, spp=64) for i in range(16)]))
+
+
+def test_energy_of_paths_from_both_ends():
+    """In a closed room of albedo 0.5 whose walls glow with radiance 1, and beside a white cube under a white sky."""
+    scene, _ = glowing_room(normals=False)
+    for depth in (2, 4, 6):
+        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": depth}), spp=256))
+        assert image.mean() == pytest.approx(2 - 0.5 ** (depth - 1), rel=2e-3)
+    scene = cases.scene(sensor=camera((1.5, 2, -3)), thing=cube(cases.diffuse(1.0)), sky=cases.constant())
+    image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 8}), spp=256))
+    assert image.mean() == pytest.approx(1, rel=2e-3)
 
 
 def test_white_cube_under_a_white_sky_is_invisible(integrator):
