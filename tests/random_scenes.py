@@ -181,7 +181,7 @@ class Generator:
         if self.home:
             self.scale, self.origin = 1.0, np.zeros(3)
         # What moves must not show instances, whose outlines are unknown: no sky, no gloss, no interreflections.
-        self.instances = self.chance(0.06) and self.special != "jumps"
+        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams")
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
