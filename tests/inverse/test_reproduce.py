@@ -14,7 +14,8 @@ from rimlight.inverse.reproduce import EXPERIMENTS, Outcome
 from rimlight.scenes import room
 
 #: Steps of a small fit, and the largest part of the error of a parameter that it may leave, and of that of the picture.
-#: About twice the largest of six seeds, of the last three of one or two. (That a square is turned hardly shows in a mirror that is 32 pixels wide.)
+#: About twice the largest of six seeds, of the last three of one or two. (That a square is turned hardly shows in a
+#: mirror that is 32 pixels wide.)
 LEFT = {
     "fig6a": (150, 0.05, 0.1),
     "fig6b": (150, 0.1, 0.1),
