@@ -7,6 +7,7 @@ import mirrors
 import mitsuba as mi
 import numpy as np
 import pytest
+from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, derivative_image
 
@@ -44,3 +45,8 @@ def test_its_motion_is_that_of_dielectric():
 def test_indices_that_are_refused(eta):
     with pytest.raises(RuntimeError, match=r'glass: "eta" must be from 0.2 to 5, but not 1, got'):
         mi.load_dict({"type": "glass", "eta": eta})
+
+
+def test_frozen_is_unfrozen():
+    scene, it = mirrors.glass_ball(GLASS), mi.load_dict({"type": "prb_edge", "max_depth": 4})
+    assert_frozen_is_unfrozen(scene, it, "ball.bsdf.eta")
