@@ -1,8 +1,8 @@
 """Make the pictures of the README and the documentation:  python docs/make_images.py [FOLDER]
 
-About eight minutes on two cores. Writes docs/images/without.webp, an animation; overview.png; normal_integration.png,
-which needs the depth of the bear of DiLiGenT in ../shared; adversarial.png, which needs the extra `adversarial`; and
-reflectance.png, if the argument names a folder with tables of the MERL database.
+About twelve minutes on two cores. Writes docs/images/without.webp, an animation; overview.png; normal_integration.png,
+which needs the depth of the bear of DiLiGenT in ../shared; jumps.png; adversarial.png, which needs the extra
+`adversarial`; and reflectance.png, if the argument names a folder with tables of the MERL database.
 """
 
 from __future__ import annotations
@@ -196,6 +196,36 @@ def adversarial(path: Path) -> None:
     figure.savefig(path)
 
 
+def jumps(path: Path) -> None:
+    """Target, start and result of the three fits of `rimlight reproduce jumps`."""
+    from rimlight import inverse
+    from rimlight.inverse import reproduce
+
+    views = {}
+    for name in reproduce.FIGURES["jumps"]:
+        with tempfile.TemporaryDirectory() as folder:
+            (view,) = inverse.fit(reproduce.problem_of(name, Path(folder))).views
+        views[name] = {"target": view.target, "start": view.start, "result": view.result}
+    draw_views(path, views)
+
+
+def draw_views(path: Path, views: dict[str, dict[str, np.ndarray]]) -> None:
+    """Pictures with titles, a row for each fit. views : linear colours, (H, W, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from rimlight import pictures
+
+    figure = Figure(figsize=(6.6, 2.2 * len(views)), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    for row, (name, images) in zip(figure.subplots(len(views), 3), views.items(), strict=True):
+        for axes, (title, image) in zip(row, images.items(), strict=True):
+            axes.imshow(pictures.to_srgb(image))
+            axes.set_title(f"{name}: {title}", fontsize=8)
+            axes.set_axis_off()
+    figure.savefig(path)
+
+
 if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
@@ -203,6 +233,7 @@ if __name__ == "__main__":
     without(IMAGES / "without.webp")
     overview(IMAGES / "overview.png")
     normal_integration(IMAGES / "normal_integration.png")
+    jumps(IMAGES / "jumps.png")
     adversarial(IMAGES / "adversarial.png")
     if len(sys.argv) > 1:
         reflectance(IMAGES / "reflectance.png", Path(sys.argv[1]))

@@ -3,6 +3,7 @@
 from .boundaries.face_planes import FacePlanes
 from .boundaries.film_boundary import BoundarySamples, FilmBoundary
 from .boundaries.horizon import Horizon, Horizons
+from .boundaries.indirect_beams import IndirectBeams
 from .boundaries.indirect_shadows import IndirectShadows
 from .boundaries.shading_boundary import ShadingBoundary
 from .boundaries.shadow_boundary import ShadowBoundary, ShadowSamples
@@ -35,6 +36,7 @@ __all__ = [
     "Geometry",
     "Horizon",
     "Horizons",
+    "IndirectBeams",
     "IndirectShadows",
     "Intersections",
     "Lights",

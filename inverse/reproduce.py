@@ -1,4 +1,4 @@
-"""The fits of Li et al. 2018, section 5, one after the other: `rimlight reproduce`.
+"""The fits of Li et al. 2018, section 5, and three of our own, one after the other: `rimlight reproduce`.
 
 Each is a scene and a TOML file in `rimlight.scenes`. Results that are there already are not made again, so that an
 interrupted run goes on where it was.
@@ -44,12 +44,16 @@ EXPERIMENTS = {
     "fig6e": "A square behind the camera, in an almost perfect mirror",
     "fig6f": "Camera in a room with soft shadows and interreflections",
     "fig10": "A stop sign that a network takes for a traffic light, by 2208 parameters",
+    "pot_in_mirror": "Pose of a teapot that only a mirror shows",
+    "ball_of_glass": "Place and index of refraction of a ball of glass",
+    "box_in_sand": "Pose of a box that is sunk into sand",
 }
 
 FIGURES = {"fig6": tuple(name for name in EXPERIMENTS if name.startswith("fig6")), "all": tuple(EXPERIMENTS)}
+FIGURES["jumps"] = "pot_in_mirror", "ball_of_glass", "box_in_sand"
 
-#: A fit of figure 6 holds if all parameters are left with at most this part of their error at the start, or if the
-#: error of its picture is at most so many times its noise.
+#: A fit of figure 6, or of `jumps`, holds if all parameters are left with at most this part of their error at the
+#: start, or if the error of its picture is at most so many times its noise.
 LEFT, NOISE = 0.01, 1.5
 
 #: That of figure 1 holds if this part of the error of the camera is left, and the median error of the materials and
@@ -108,7 +112,7 @@ def reproduce(
 ) -> list[Outcome]:
     """Run the experiments of a figure, with a report for each fit, and a summary in `out`.
 
-    figure : "fig1", "fig6a", …, "fig6", "fig10", or "all", which is without fig10 where its packages are missing.
+    figure : one of `EXPERIMENTS` or of `FIGURES`; "all" is without fig10 where its packages are missing.
     peer : fit with Mitsuba's `prb_projective`, too, for as long as our fit took.
 
     Raises

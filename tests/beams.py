@@ -58,6 +58,27 @@ def on_cube(lamp: Callable[[], dict]) -> Callable[[], mi.Scene]:
     )
 
 
+def hidden(lamp: Callable[[], dict]) -> Callable[[], mi.Scene]:
+    """The camera sees a wall, which is lit by a floor below the frame and a low step in it; on these falls a beam. All
+    of the derivative comes from light that is scattered twice."""
+
+    def build() -> mi.Scene:
+        return scene(
+            sensor=camera((0, 1.2, -4), (0, 1.2, 2), fov=24),
+            wall=quad((-2, 0, 1.2), (0, 3, 0), (4, 0, 0), "wall", bsdf=diffuse(0.7, 0.6, 0.5, two_sided=True)),
+            floor=horizontal((0, 0, 0), 1.2, "floor", bsdf=diffuse(0.6, 0.7, 0.8)),
+            step=mesh("step", 0.15 * cube_vertices() + [0.3, 0, 0.2], CUBE_FACES, bsdf=diffuse(0.7, 0.5, 0.4)),
+            lamp=lamp(),
+        )
+
+    return build
+
+
+def from_above(lamp: dict) -> dict:
+    """A lamp above the floor of `hidden`."""
+    return {**lamp, "to_world": mi.ScalarTransform4f().look_at([0.1, 2.5, -0.1], [0.1, 0, 0.1], [0, 0, 1])}
+
+
 def in_mirror() -> mi.Scene:
     """A floor on which the beam ends, and a mirror that shows it."""
     mirror = quad((-2, -0.8, 1.3), (0, 2.5, 0), (4, 0, 0.4), "mirror", bsdf={"type": "conductor"})
@@ -92,4 +113,8 @@ BEAMS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "lamp_with_picture": (on_cube(lamp_with_picture), LAMP_ALONG, 3e-3, 2),
     "beam_on_large_floor": (on_large_floor, {"key": "sensor.to_world", "direction": [1, 0, 0]}, 3e-2, 2),
     "beam_in_mirror": (in_mirror, LAMP_ALONG, 2e-3, 3),
+    "hidden_beam_turns": (hidden(lambda: from_above(hard_spot())), LAMP, 3e-2, 3),
+    "hidden_beam_widens": (hidden(lambda: from_above(hard_spot())), CUTOFF, 2.0, 3),
+    "hidden_picture": (hidden(lambda: from_above(picture())), LAMP_ALONG, 4e-2, 3),
+    "picture_on_cube": (on_cube(picture), SLIDE, 2e-3, 4),
 }

@@ -29,7 +29,7 @@ from building import (
     scene,
 )
 from cuts import CUTS
-from mirrors import MIRRORS
+from mirrors import MIRRORS, ball_of_index
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
 
@@ -581,6 +581,7 @@ def lit_room() -> mi.Scene:
 
 
 DEPTH = {"key": "cube.vertex_positions", "direction": [0, 0, 1]}
+INDEX = {"key": "ball.bsdf.eta", "direction": [1]}
 SIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.2, 1, 0]}
 DIRECTIONS = {"key": "lamp.directions", "direction": [0.3, 0, 1, 1, 0, 0, 0, 0.5, 0.5]}
@@ -893,6 +894,7 @@ CASES = [
     Case("sky_blocker", sky_blocker, BLOCKER_SIDE, 5e-2, spp=256, runs=48),
     *(Case(k, *of, spp=64, runs=12, integrator=prb_edge(4), reference_spp=4096) for k, of in ROOMS.items()),
     Case("hidden_shadow", hidden_shadow, BOARD_ALONG, 1e-2, spp=128, runs=24, integrator=prb_edge(3)),
+    Case("glass_index", ball_of_index, INDEX, 5e-3, integrator=prb_edge(6), reference_spp=1024),
     Case("box_behind_glass", box_behind_glass, BOX_ALONG, 1e-2, spp=256, runs=24, integrator=prb_edge(3)),
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096)

@@ -65,9 +65,15 @@ def before_bar(shape: dict) -> mi.Scene:
     return scene(sensor=at, ball=shape, bar=bar(), sky=constant(0.2))
 
 
-def glass_ball() -> mi.Scene:
+def glass_ball(bsdf: dict | None = None) -> mi.Scene:
     """A ball of glass before a bar that shines."""
-    return before_bar({"type": "sphere", "center": [0, 0.4, -0.4], "radius": 0.6, "bsdf": {"type": "dielectric"}})
+    bsdf = bsdf or {"type": "dielectric"}
+    return before_bar({"type": "sphere", "center": [0, 0.4, -0.4], "radius": 0.6, "bsdf": bsdf})
+
+
+def ball_of_index() -> mi.Scene:
+    """The same, of glass whose index changes."""
+    return glass_ball({"type": "glass", "eta": 1.4})
 
 
 def mirrored_ball() -> mi.Scene:

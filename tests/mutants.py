@@ -268,6 +268,18 @@ MUTANTS = [
         "return 1.02 * jump * dr.dot(n_dl,",
     ),
     mutant(
+        "beams in indirect light: their lines stand still when the light turns",
+        "edge_sampling/boundaries/indirect_beams.py",
+        "        return self.lines.ray(light.light, self._on_picture(edge.sample)[0])",
+        "        return dr.detach(self.lines.ray(light.light, self._on_picture(edge.sample)[0]))",
+    ),
+    mutant(
+        "beams in indirect light: the other side of a line is dark",
+        "edge_sampling/boundaries/indirect_beams.py",
+        "for sign in (1, -1):",
+        "for sign in (1,):",
+    ),
+    mutant(
         "chain: cut behind the second vertex",
         REPLAY,
         "ray.o, ray.d = dr.replace_grad(ray.o, o), dr.replace_grad(ray.d, d)",

@@ -55,7 +55,7 @@ SQUARE, LARGEST = 5, 5.5
 SPECIAL = {
     "cut": "meshes stand in the floor, and in each other; none of them is a lamp",
     "jumps": "all that things have are perfect mirrors, smooth glass, and textures that jump",
-    "beams": "spots and projectors light them, whose beams end with a jump, in direct light",
+    "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 
@@ -181,11 +181,11 @@ class Generator:
         if self.home:
             self.scale, self.origin = 1.0, np.zeros(3)
         # What moves must not show instances, whose outlines are unknown: no sky, no gloss, no interreflections.
-        self.instances = self.chance(0.06) and self.special != "jumps"
+        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams")
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
-        direct = {"jumps": not self.glows, "beams": True}.get(self.special, direct)
+        direct = {"jumps": not self.glows, "beams": False}.get(self.special, direct)
         self.depth = depth = 2 if direct else int(self.rng.integers(2, 6))
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")

@@ -26,7 +26,7 @@ MORE_CASES = (
     "led_moves distant_cube discs_lights discs_radius smooth_torus_sun sphere_sun sphere_light surroundings "
     "reflecting_ball light_out_of_frame sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
     "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
-    "box_behind_glass"
+    "hidden_picture box_behind_glass"
 )
 
 #: Slow tests, by how their names begin.
@@ -204,11 +204,13 @@ test_prb_edge.py::test_terms_add_up[vertices-False]
 test_reflectance.py::test_dictionary_of_the_package
 test_reflectance.py::test_reduction_finds_the_lobes_of_the_tables
 test_reflectance.py::test_reduction_keeps_few_alphas_and_etas
+test_reproduce.py::test_small_fit_converges[ball_of_glass]
 test_reproduce.py::test_small_fit_converges[fig6b]
 test_reproduce.py::test_small_fit_converges[fig6c]
 test_reproduce.py::test_small_fit_converges[fig6d]
 test_reproduce.py::test_small_fit_converges[fig6e]
 test_reproduce.py::test_small_fit_converges[fig6f]
+test_reproduce.py::test_small_fit_converges[pot_in_mirror]
 test_rig.py::test_forward_and_backward_agree
 test_rig.py::test_frozen_steps[sensor.to_world]
 test_rig.py::test_interior_agrees_with_prb_edge[cube.bsdf

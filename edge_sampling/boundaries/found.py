@@ -24,12 +24,12 @@ class Boundaries:
     `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` :
     those whose fringe is not looked at closely. `textures` : where those jump that the camera may see move, and mapped
     normals turn away. `surfaces` : what chains meet, where there are mirrors or textures. `lights` : chooses one, where
-    there are many."""
+    there are many. `indirect` : shadows, and borders of beams, in indirect light."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
     shading: ShadingBoundary | None = None
-    indirect: IndirectShadows | None = None
+    indirect: tuple[IndirectShadows, ...] = ()
     planes: FacePlanes | None = None
     moving: tuple[bool, ...] = ()
     camera_moves: bool = False

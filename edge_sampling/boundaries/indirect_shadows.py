@@ -131,7 +131,7 @@ class IndirectShadows(ShadowBoundary):
             at = _OnLight((choice + k) * (len(self) / CANDIDATES), sampler.next_2d())
             light = self._point_on_light(scene, at.choice, z.time, at.numbers)
             edge = self._edge(placement, light, sampler)
-            target = self._unshadowed(z, light, edge, fall(scene, light, edge), active)
+            target = self._unshadowed(scene, z, light, edge, fall(scene, light, edge), active)
             edge.sample.density *= light.density
             reservoir, taken = reservoir.take(edge.sample, target, sampler, active)
             return k + 1, dr.select(taken, at, on_light), reservoir, sampler
@@ -146,18 +146,25 @@ class IndirectShadows(ShadowBoundary):
         light = self._point_on_light(scene, at.choice, z.time, at.numbers)
         return light, self._edge_at(placement, light, reservoir.kept(CANDIDATES))
 
-    @staticmethod
-    def _unshadowed(z, light: LightPoint, edge: LitEdge, shadow: Shadow, active: mi.Bool) -> mi.Float:
+    def _unshadowed(
+        self, scene: mi.Scene, z: mi.SurfaceInteraction3f, light: LightPoint, edge: LitEdge, shadow: Shadow, active
+    ) -> mi.Float:
         """About what a shadow does to the light of a point, if nothing hides it, and all surfaces are equal."""
-        active = active & shadow.active
+        arrives = dr.abs_dot(shadow.facing, edge.ω) * dr.select(light.on_surface, dr.abs_dot(light.n, edge.ω), 1)
+        arrives *= dr.rcp(dr.select(light.far, 1, dr.squared_norm(shadow.x - light.y)))
+        return self._reflected(z, light, edge, shadow, arrives, active & shadow.active)
+
+    @staticmethod
+    def _reflected(
+        z: mi.SurfaceInteraction3f, light: LightPoint, edge: LitEdge, shadow: Shadow, arrives: mi.Float, active
+    ) -> mi.Float:
+        """What a point reflects of it. arrives : at the surface on which the shadow falls."""
         d = shadow.x - z.p
         r2 = dr.squared_norm(d)
         ω = d * dr.rsqrt(r2)
         f = dr.max(z.bsdf().eval(mi.BSDFContext(), z, z.to_local(ω), active))
         along = dr.norm(dr.cross(shadow.facing, thrown(edge.tangent, light, edge, shadow)))
-        lit = dr.abs_dot(shadow.facing, edge.ω) * dr.select(light.on_surface, dr.abs_dot(light.n, edge.ω), 1)
-        lit *= dr.rcp(dr.select(light.far, 1, dr.squared_norm(shadow.x - light.y)))
-        return dr.select(active, f * dr.abs_dot(shadow.facing, ω) / r2 * along * lit, 0)
+        return dr.select(active, f * dr.abs_dot(shadow.facing, ω) / r2 * along * arrives, 0)
 
 
 @dataclass

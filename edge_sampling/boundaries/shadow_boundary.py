@@ -141,13 +141,18 @@ class ShadowBoundary:
 
         met : what the ray from there to the light meets.
         """
-        p = self.silhouettes.point(placement, edge.sample, light.y, light.far).p
-        q = self._follow(scene, light, shadow.onwards, met, active)
-        # From the light past the edge to the plane in which the shadow falls. (Its turning is of second order.)
-        d = dr.select(light.far, -mi.Vector3f(q), p - q)
-        origin = dr.select(light.far, p, q)
+        # To the plane in which the shadow falls. (Its turning is of second order.)
+        origin, d = self._past(scene, placement, light, edge, shadow, met, active)
         s = (dr.dot(shadow.facing, m - origin) + shadow.lift) / dr.dot(shadow.facing, d)
         return mi.Point3f(origin + dr.select(active, s, 1) * d - shadow.facing * shadow.lift)
+
+    def _past(
+        self, scene: mi.Scene, placement: Placement, light: LightPoint, edge: LitEdge, shadow: Shadow, met, active
+    ) -> tuple[mi.Point3f, mi.Vector3f]:
+        """The line from the light past the edge: a point of it, and its direction; attached to both."""
+        p = self.silhouettes.point(placement, edge.sample, light.y, light.far).p
+        q = self._follow(scene, light, shadow.onwards, met, active)
+        return dr.select(light.far, p, q), dr.select(light.far, -mi.Vector3f(q), p - q)
 
     # ---------------------- From a light to an edge ----------------------
 

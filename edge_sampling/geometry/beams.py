@@ -49,6 +49,24 @@ def on_texture(emitter: mi.Emitter, si: mi.SurfaceInteraction3f) -> mi.Point2f:
     return mi.Point2f(0.5 + p.x / size, 0.5 + p.y / size)
 
 
+def off_texture(emitter: mi.Emitter, uv: mi.Point2f) -> mi.Point2f:
+    """The inverse of `on_texture`: the point, in the frame of the light at the distance 1 along z, on which a place of
+    its texture falls. Attached to the angle of a spot."""
+    if emitter.class_name() == "SpotLight":
+        size = 2 * dr.tan(dr.deg2rad(mi.traverse(emitter)["cutoff_angle"]))
+        return mi.Point2f((uv.x - 0.5) * size, (uv.y - 0.5) * size)
+    # The texture is seen in perspective: of points at this distance, the coordinates are affine.
+    with dr.suspend_grad():
+        to_world, si = mi.traverse(emitter)["to_world"], dr.zeros(mi.SurfaceInteraction3f)
+        places = []
+        for p in ((0, 0, 1), (1, 0, 1), (0, 1, 1)):
+            si.p = to_world @ mi.Point3f(*p)
+            places.append(on_texture(emitter, si))
+        centre, x, y = places[0], places[1] - places[0], places[2] - places[0]
+        inverse = dr.rcp(mi.Matrix2f(x.x, y.x, x.y, y.y))
+        return mi.Point2f(inverse @ mi.Vector2f(uv - centre))
+
+
 def _in_frame(emitter: mi.Emitter, si: mi.SurfaceInteraction3f) -> mi.Point3f:
     """A point in the frame of a light, which shines along +z."""
     return mi.traverse(emitter)["to_world"].inverse() @ si.p

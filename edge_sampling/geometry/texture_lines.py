@@ -72,7 +72,7 @@ class TextureLines:
         # there, and so may whether they turn away.
         of_shapes = [(s, [*mapped_horizons(s), *(Lattice(m) for m in _matrices(s))]) for s in shapes]
         # The border of a beam counts where the texture of the light jumps as well.
-        of_lights = [kind for light in lights for kind in _of_beam(light)]
+        of_lights = [kind for light in lights for kind in lines_of_beam(light)]
         self.kinds = [kind for _, kinds in of_shapes for kind in kinds] + of_lights
         #: The largest value of each function where the texture coordinates are at most 1.
         self._sizes = mi.Float([k.size for k in self.kinds] or [1])
@@ -140,7 +140,7 @@ def _is_one_of(si: mi.SurfaceInteraction3f, shapes: Sequence[Any]) -> mi.Bool:
     return found
 
 
-def _of_beam(light: mi.Emitter) -> list[Any]:
+def lines_of_beam(light: mi.Emitter) -> list[Any]:
     """Where the light of a spot or a projector jumps."""
     border = [BeamBorder(light)] if has_hard_beam(light) else []
     return [*(Lattice(m, light) for m in _matrices(light)), *border] if light.class_name() in BEAMS else []

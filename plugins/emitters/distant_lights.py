@@ -138,6 +138,11 @@ class DistantLights(mi.Emitter):
 
     # ---------------------- Parameters ----------------------
 
+    @property
+    def shows_discs(self) -> bool:
+        """Are there discs that a camera may see?"""
+        return self._discs
+
     def traverse(self, cb: mi.TraversalCallback) -> None:
         smooth, jumps = mi.ParamFlags.Differentiable, mi.ParamFlags.Discontinuous
         cb.put("directions", self.directions, smooth | jumps)

@@ -42,7 +42,7 @@ class Moving:
     """What moves.
 
     known : the shapes that can: meshes, then analytic shapes. flags : do they? camera, lights : do these?
-    mapped : shapes whose normal maps or bump maps change.
+    mapped : shapes whose normal maps or bump maps change, or the index of whose glass.
     """
 
     known: tuple[Any, ...]
@@ -106,11 +106,10 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             'environment and all that edges do to indirect light; set "sppi" to 0 to accept this.'
         )
     beams = names(e for e in scene.emitters() if has_hard_beam(e))
-    if beams and (depths.scatters(2) or not from_points):
+    if beams and not from_points:
         limits.append(
-            f"the derivative lacks{', in indirect light,' if from_points else ''} the border of the beams of "
-            f"{', '.join(beams)}: give a spot a beam_width below its cutoff_angle, and a projector an image with a "
-            "black border."
+            f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below its "
+            "cutoff_angle, and a projector an image with a black border."
         )
     if any(is_mirror(s) for s in scene.shapes()) and (depths.scatters(2) or not from_points):
         lacks = "outlines in the light that perfect mirrors and glass throw on other surfaces"
@@ -139,13 +138,6 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
     limits = []
     beams = [e for e in scene.emitters() if e.class_name() in BEAMS] if bisects else []
     textures = jumping_textures(scene, besides=(*scene.shapes(), *beams) if bisects else ())
-    thrown = jumping_textures(scene, besides=scene.shapes()) if beams and depths.scatters(2) else []
-    thrown = [name for name in thrown if name not in textures]
-    if thrown:
-        limits.append(
-            f"the derivative lacks, in indirect light, the jumps of the textures {', '.join(thrown)}; use bilinear "
-            "bitmaps."
-        )
     if textures:
         limits.append(
             f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
@@ -162,10 +154,18 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
             f"{', '.join(mapped)} turn away from what they light."
         )
-    if (moving.camera or moving.lights) and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
+    shown = depths.scatters(1) and any(is_mirror(s) for s in scene.shapes())
+    slides = moving.camera or moving.lights or (shown and moving.anything)
+    if slides and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
         limits.append(
             "the derivative lacks the motion of the border of the sun; set the sun_scale of sunsky to 0, and add a "
             "directional light."
+        )
+    discs = names(e for e in scene.emitters() if getattr(e, "shows_discs", False)) if slides else []
+    if discs:
+        limits.append(
+            f"the derivative lacks the outlines of the discs of {', '.join(discs)}, where the camera sees them, or "
+            "mirrors show them."
         )
     return limits
 

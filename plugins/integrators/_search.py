@@ -14,6 +14,7 @@ from rimlight.edge_sampling import (
     FacePlanes,
     FilmBoundary,
     Geometry,
+    IndirectBeams,
     IndirectShadows,
     Intersections,
     Lights,
@@ -23,6 +24,7 @@ from rimlight.edge_sampling import (
     Sources,
     TextureLines,
     find_welded_edges,
+    objects_below,
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
@@ -65,6 +67,8 @@ class BoundarySearch:
         self._partial: PartialParameters | None = None
         self._media: Media | None = None
         self._maps: list[MappedHorizon] = []
+        #: Shapes with materials that may come to throw rays in other directions: those that know of `turns`.
+        self._bent: list[tuple[mi.Shape, mi.BSDF]] = []
         self._beyond: dict[tuple, tuple[mi.Sensor, list[str]]] = {}
         self._boundaries: dict[tuple, Boundaries] = {}
 
@@ -116,7 +120,7 @@ class BoundarySearch:
         self._refuse_while_recording()
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
         self.geometry = self.edges = self._lines = self._sources = self._partial = self._media = None
-        self._boundaries, self._beyond, self._maps = {}, {}, []
+        self._boundaries, self._beyond, self._maps, self._bent = {}, {}, [], []
         collect_before()
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
@@ -124,6 +128,7 @@ class BoundarySearch:
         self._sources = Sources(scene, found, geometry, self.edges, weld)
         self._partial, self._media = PartialParameters(scene), Media(scene)
         self._maps = [m for s in scene.shapes() for m in mapped_horizons(s)]
+        self._bent = [(s, o) for s in scene.shapes() for o in objects_below(s).values() if hasattr(o, "turns")]
 
     def _find_lines(self, scene: mi.Scene) -> None:
         """Find the lines in which the meshes cut through each other now."""
@@ -164,7 +169,8 @@ class BoundarySearch:
         others = [] if only_shapes else [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
         others = [mi.traverse(e) for e in others]
         lights = lamps or any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
-        mapped = tuple(dict.fromkeys(m.shape for m in self._maps if m.turns))
+        turned = (*((m.shape, m) for m in self._maps), *self._bent)
+        mapped = tuple(dict.fromkeys(shape for shape, what in turned if what.turns))
         return Moving(shapes, moves, camera, lights, mapped)
 
     # ---------------------- Boundaries ----------------------
@@ -201,20 +207,21 @@ class BoundarySearch:
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int
-    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, IndirectShadows | None]:
+    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, tuple[IndirectShadows, ...]]:
         """What samples the edges of which lights and shading points know, as far as it is needed."""
         if not sppi or not scene.emitters() or not self.depths.scatters(1):
-            return None, None, None
+            return None, None, ()
         everything = moving.camera or moving.lights
         silhouettes = Silhouettes(self.geometry, self._edges_and_lines, None if everything else moving.flags)
         if not len(silhouettes):
-            return None, None, None
-        shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, None
+            return None, None, ()
+        shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, ()
         if self.from_points:
             shading = ShadingBoundary(scene, silhouettes, None if everything else list(moving.shapes))
             shading = shading if self.depths.scatters(2) or shading.emission_at_first else None
-            indirect = IndirectShadows(scene, silhouettes) if self.depths.scatters(2) else None
-        return shadows if len(shadows) else None, shading, indirect if indirect and len(indirect) else None
+            kinds = (IndirectShadows, IndirectBeams) if self.depths.scatters(2) else ()
+            indirect = tuple(found for kind in kinds if len(found := kind(scene, silhouettes)))
+        return shadows if len(shadows) else None, shading, indirect
 
     def _face_planes(self, scene: mi.Scene, moving: Moving) -> FacePlanes | None:
         """What samples the planes of faces, if what they hide can change: where the faces move, or what lights them.

@@ -110,7 +110,7 @@ class EdgeIntegrator(ADIntegrator):
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Forward)
             job.boundaries.refit()
             terms, values = [], []
-            for make in (make for term in self.TERMS for make in term.samples(job.of(term))):
+            for make in (make for term, own in job.each for make in term.samples(own)):
                 # One term after the other: path replay needs that nothing else is attached to the parameters.
                 term, value = forward(make)
                 terms.append(term)
@@ -127,7 +127,7 @@ class EdgeIntegrator(ADIntegrator):
         with dr.isolate_grad(), dr.suspend_grad():
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Backward)
             job.boundaries.refit()
-            terms = [make() for term in self.TERMS for make in term.samples(job.of(term))]
+            terms = [make() for term, own in job.each for make in term.samples(own)]
             with dr.resume_grad():
                 # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
                 # is traced for it.
@@ -219,7 +219,7 @@ class EdgeIntegrator(ADIntegrator):
         tracer = self.TRACER(scene, self)
         tracer.glass, tracer.lights = boundaries.glass, boundaries.lights
         tracer.fine_mirrors = boundaries.fine_mirrors
-        return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.shares)
+        return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.TERMS, self.shares)
 
     @no_collection()
     def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:
@@ -235,7 +235,7 @@ class EdgeIntegrator(ADIntegrator):
             lights_move=found.lights_move,
             edges=len(search.edges),
             tree=found.silhouettes.leaves if found.silhouettes is not None else 0,
-            terms=tuple(term.planned(job.of(term)) for term in self.TERMS),
+            terms=tuple(term.planned(own) for term, own in job.each),
             limits=found.limits,
         )
 

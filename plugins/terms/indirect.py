@@ -1,4 +1,4 @@
-"""Shadows in indirect light, found from the lights, as a term."""
+"""Shadows and borders of beams in indirect light, found from the lights, as a term."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
+from rimlight.edge_sampling import IndirectShadows
 from rimlight.transport.cut import Cut
 from rimlight.transport.replay import ChosenVertex
 
@@ -14,23 +15,28 @@ from .term import Job
 
 
 class IndirectShadowsTerm(FromPoints):
-    """Edges as the lights see them, by the shadows on what lights the vertices of paths."""
+    """Edges as the lights see them, and lines of beams, by what jumps there on what lights the vertices of paths."""
 
     name, effort = "shadows in indirect light", 3.0
 
     def planned(self, job: Job) -> PlannedTerm:
-        lights = len(self.boundary(job)) if self.boundary(job) is not None else 0
-        count = job.counts.shading * job.pixels if lights else 0
-        return self.plan(count, job.rays_of_path, f"{lights} lights", "no light is scattered twice, or no edge moves")
+        found = self.boundary(job)
+        count = job.counts.shading * job.pixels if found else 0
+        why = f"{max(map(len, found), default=0)} lights"
+        return self.plan(count, job.rays_of_path, why, "no light is scattered twice, or no edge moves")
 
-    def boundary(self, job: Job) -> object | None:
+    def boundary(self, job: Job) -> tuple[IndirectShadows, ...]:
         return job.boundaries.indirect
 
     def reflected(
         self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
     ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
-        shadows = job.boundaries.indirect
-        placement, point, cuts = placement_and_point(job, shadows.silhouettes, ray, sampler, beyond=1)
-        L = shadows.at(job.tracer, placement, point, sampler, choice)
+        boundaries = self.boundary(job)
+        placement, point, cuts = placement_and_point(job, boundaries[0].silhouettes, ray, sampler, beyond=1)
+        L = mi.Spectrum(0)
+        for boundary in boundaries:
+            of_one = boundary.at(job.tracer, placement, point, sampler, choice)
+            with dr.resume_grad():
+                L += of_one
         with dr.resume_grad():
             return L * point.β, cuts

@@ -24,7 +24,7 @@ class FromPoints(Term):
     """What one vertex of each path sees of boundaries."""
 
     def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
-        return [lambda: self._samples(job)] if self.boundary(job) is not None else []
+        return [lambda: self._samples(job)] if self.boundary(job) else []
 
     def _samples(self, job: Job) -> FilmSamples:
         seed = seed_of(self.name, job.seed)
@@ -38,8 +38,8 @@ class FromPoints(Term):
         return FilmSamples(position, value, ray.wavelengths, 0.0, spp, cuts=(*cuts, rays))
 
     @abstractmethod
-    def boundary(self, job: Job) -> object | None:
-        """What is sampled; None: nothing."""
+    def boundary(self, job: Job) -> object:
+        """What is sampled; nothing, if it is false."""
 
     @abstractmethod
     def reflected(

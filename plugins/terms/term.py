@@ -83,6 +83,7 @@ class Job:
     """One derivative: of what, as seen from where, along which boundaries, with how many samples.
 
     sample_rays : maps a sampler to camera rays, their weights, and film positions in pixels.
+    terms : of the derivative, in their order.
     shares : by what the samples of a term are multiplied, by its name; 1 if it is not there.
     """
 
@@ -93,14 +94,17 @@ class Job:
     sample_rays: Callable[[mi.Sampler], tuple[Any, Any, Any]]
     seed: int | mi.UInt32 = 0
     mode: dr.ADMode = dr.ADMode.Primal
+    terms: tuple[Term, ...] = ()
     shares: dict[str, float] = field(default_factory=dict)
 
-    def of(self, term: Term) -> Job:
-        """What one term is to do of it."""
+    @property
+    def each(self) -> list[tuple[Term, Job]]:
+        """The terms, and what each is to do of it."""
         if not self.shares:
-            return self
-        interior, own = (self.shares.get(name, 1.0) for name in (INTERIOR, term.name))
-        return replace(self, counts=self.counts.shared(interior, own))
+            return [(term, self) for term in self.terms]
+        shares = [[self.shares.get(name, 1.0) for name in (INTERIOR, term.name)] for term in self.terms]
+        counts = [self.counts.shared(*share) for share in shares]
+        return [(term, replace(self, counts=own)) for term, own in zip(self.terms, counts, strict=True)]
 
     @cached_property
     def parts(self) -> list[FilmPart]:

@@ -14,7 +14,8 @@ from rimlight.inverse.reproduce import EXPERIMENTS, Outcome
 from rimlight.scenes import room
 
 #: Steps of a small fit, and the largest part of the error of a parameter that it may leave, and of that of the picture.
-#: About twice the largest of six seeds. (That a square is turned hardly shows in a mirror that is 32 pixels wide.)
+#: About twice the largest of six seeds, of the last three of one or two. (That a square is turned hardly shows in a
+#: mirror that is 32 pixels wide.)
 LEFT = {
     "fig6a": (150, 0.05, 0.1),
     "fig6b": (150, 0.1, 0.1),
@@ -22,6 +23,9 @@ LEFT = {
     "fig6d": (150, 0.1, 0.15),
     "fig6e": (150, 1, 0.2),
     "fig6f": (300, 0.7, 0.2),
+    "box_in_sand": (100, 0.3, 0.4),
+    "pot_in_mirror": (300, 0.3, 0.15),
+    "ball_of_glass": (200, 0.7, 0.4),
 }
 
 

@@ -4,6 +4,7 @@ Finite differences are stored; ``RENEW_REFERENCES=1 python -m pytest tests/plugi
 them anew.
 """
 
+import beams
 import cases
 import drjit as dr
 import mitsuba as mi
@@ -76,9 +77,9 @@ def test_what_moves_past_an_edge_that_stands_still():
     assert not found.zero and not found.faults(noise=0.25), str(found)
 
 
-@pytest.mark.parametrize("case", ["corner_dolly", "sun_through_window"])
+@pytest.mark.parametrize("case", ["corner_dolly", "sun_through_window", "hidden_picture"])
 def test_forward_equals_backward(case):
-    build, motion, _ = rooms.ROOMS[case]
+    build, motion, *_ = (rooms.ROOMS | beams.BEAMS)[case]
     s = build()
     motion = Motion(s, **motion)
     it = mi.load_dict({"type": "prb_edge", "max_depth": -1, "rr_depth": 3})

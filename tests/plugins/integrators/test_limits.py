@@ -238,3 +238,26 @@ def test_analytic_shapes_that_cut_others_are_warned_about(kind, height):
     floor = cases.horizontal((0, 0, 0), 2, "floor", bsdf=cases.diffuse(0.5, two_sided=True))
     found = said(cases.scene(sensor=cases.camera(), thing=thing, floor=floor, sky=cases.constant()), "thing.to_world")
     assert any("cut through other shapes" in message and '"floor"' in message for message in found) == (height < 0)
+
+
+SKIES = {
+    "the border of the sun": {"type": "sunsky", "sun_direction": [0.2, 1, 0.3]},
+    'the outlines of the discs of "sky"': {"type": "distant_lights", "directions": "0 1 0", "angular_radius": 3.0},
+}
+
+
+@pytest.mark.parametrize("text", SKIES)
+@pytest.mark.parametrize(
+    ("bsdf", "key", "warned"),
+    [
+        ("conductor", "plate.vertex_positions", True),
+        ("diffuse", "plate.vertex_positions", False),
+        ("diffuse", "sensor.to_world", True),
+    ],
+)
+def test_suns_whose_outlines_are_seen(text, bsdf, key, warned):
+    """By a camera that moves, or in a mirror that does."""
+    plate = cases.horizontal((0, 0, 0), 1, "plate", bsdf={"type": bsdf})
+    scene = cases.scene(sensor=cases.camera(), plate=plate, sky=SKIES[text])
+    found = said(scene, key, kind="prb_edge", max_depth=3)
+    assert any(text in message for message in found) == warned

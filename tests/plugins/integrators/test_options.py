@@ -68,6 +68,7 @@ def test_options_of_the_projective_integrators_have_no_effect(kind):
     [
         {"type": "blinn_phong"},
         {"type": "ggx_dictionary", "material": "gold-paint"},
+        {"type": "glass"},
         {"type": "distant_lights", "directions": "0 0 1"},
         {"type": "led"},
         {"type": "fisheye"},

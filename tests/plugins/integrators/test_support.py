@@ -789,6 +789,7 @@ ELSEWHERE = {
     "`fisheye`": ["fisheye_cube", "fisheye_camera", "fisheye_camera_rotation", "fisheye_field_of_view"],
     "`batch` of the above": ["batch_cube", "batch_camera"],
     "`thindielectric`": [test_thin_glass_changes],
+    "`glass`": ["glass_index"],  # otherwise as `dielectric`: see test_glass.py
     "`merl`": [test_measured_material],
     "`ggx_dictionary`": [test_dictionary_of_lobes],
     "`area` on meshes": ["shadow_light", "room_light"],
