@@ -8,7 +8,7 @@ found = inverse.fit(problem, out="result")
 inverse.write("result", found, title="My fit")
 """
 
-from .executors import Cluster, Processes
+from .executors import Cluster
 from .fitting import Fit, fit
 from .losses import Loss, LossFunction, drjit_loss
 from .problem import Free, Problem, Stage, Starts, Target, read
@@ -26,7 +26,6 @@ __all__ = [
     "Loss",
     "LossFunction",
     "Problem",
-    "Processes",
     "Result",
     "Stage",
     "Starts",

@@ -36,9 +36,9 @@ class Fit:
     resume: bool = False
     """Continue from the checkpoint in that folder."""
     workers: int = 0
-    """Number of processes that share the work. 0: this process does all of it."""
+    """Number of processes of this machine that share the work. 0: this process does all of it."""
     cluster: str | None = None
-    """Address of the scheduler of a Dask cluster, or "local"."""
+    """Address of the scheduler of a Dask cluster, such as tcp://10.0.0.1:8786, whose workers share the work."""
     watch: bool = False
     """Show the report while the fit runs, on a page that only this machine can open. Its address is printed."""
     tensorboard: bool = False
@@ -60,10 +60,8 @@ class Fit:
         logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
         with ExitStack() as stack, expected(OSError):
             executor = None
-            if self.cluster is not None:
-                executor = stack.enter_context(inverse.Cluster(problem, self.cluster))
-            elif self.workers:
-                executor = stack.enter_context(inverse.Processes(problem, self.workers))
+            if self.cluster is not None or self.workers:
+                executor = stack.enter_context(inverse.Cluster(problem, self.cluster or self.workers))
             fit = inverse.Fit(
                 problem, out=self.out, resume=self.resume, executor=executor, tensorboard=self.tensorboard
             )

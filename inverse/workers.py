@@ -1,0 +1,333 @@
+"""Processes of a Dask cluster that do work for a fit, on this machine or on many.
+
+Dask connects the processes, carries functions and arrays, and starts a process anew that dies. Added here: one task at
+a time in a process, whose threads are its share of those of its machine; work belongs to a worker, which remembers what
+it needs for it; and what was given out is given out again, as a whole, if one of its workers is lost.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+import rimlight
+from rimlight.edge_sampling.refusals import InputError, Refusal
+from rimlight.loading import one_line
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at who is there, while work is being done.
+POLL = 1.0
+
+#: Seconds without a sign of life after which a worker counts as lost. Busy ones give signs, too.
+SILENT = 60.0
+
+#: Seconds to wait for the first worker, or for a new one after all were lost.
+PATIENCE = 120.0
+
+#: How often work is given out whose workers were lost.
+TRIES = 5
+
+#: Parts that are added up by one task.
+FAN = 8
+
+
+class Lost(Refusal):
+    """Workers or their scheduler are lost for good. The text is one line that says what to do."""
+
+
+@dataclass(frozen=True)
+class Worker:
+    """address : of a worker. name : for the order of all of them, which survives a restart. share : how many workers
+    its machine has. silent : seconds since its last sign of life."""
+
+    address: str
+    name: str
+    share: int
+    silent: float
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What a worker raised, in place of a result."""
+
+    error: Exception
+
+
+class Workers:
+    """The workers of a Dask cluster.
+
+    cluster : how many processes to start on this machine; or the address of a scheduler, such as
+        "tcp://10.0.0.1:8786"; or a cluster of one of Dask's deployers, or a client of one.
+    threads : of each process. Default: its share of the cores of its machine.
+
+    Raises
+    ------
+    InputError : there is no such cluster, or Dask is not installed.
+    """
+
+    def __init__(self, cluster: int | str | Any, threads: int | None = None):
+        try:
+            from distributed import Client, LocalCluster
+        except ImportError:
+            raise InputError("workers need the package distributed: pip install 'rimlight[cluster]'") from None
+        if isinstance(cluster, int) and cluster < 1:
+            raise InputError(f"the number of workers must be >= 1, got {cluster}")
+        self.threads = threads
+        self._last: tuple[float, list[Worker]] | None = None  # when was looked for workers, and who was there
+        self._kept: tuple[list[str], Any, Any] | None = None  # workers that hold a thing, and their future
+        self._mine: list[Any] = []
+        if isinstance(cluster, int):
+            cluster = LocalCluster(
+                n_workers=cluster, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+            )
+            self._mine.append(cluster)
+        try:
+            if isinstance(cluster, Client):
+                self.client = cluster
+            else:
+                self.client = Client(cluster, timeout=20, set_as_default=False)
+                self._mine.insert(0, self.client)
+        except (OSError, ValueError) as error:
+            raise InputError(f'no cluster at "{cluster}": {error}') from None
+
+    def close(self) -> None:
+        """Close what was opened here. What was given stays as it was."""
+        for opened in self._mine:
+            opened.close()
+
+    # ---------------------- Work ----------------------
+
+    def run(
+        self,
+        function: Callable[..., Any],
+        kept: Any,
+        shared: Any,
+        calls: Callable[[int], Iterable[tuple[int, tuple]]],
+        combine: Callable[[list, bool], Any] | None = None,
+    ) -> list[Any]:
+        """Results of `function(kept, shared, *arguments)`, in the order of the calls.
+
+        function : pure, so that it can be called again.
+        kept : the same object in many runs, such as the text of a problem: it travels to each worker once. shared : of
+            this run. Both travel from here to one worker, and from worker to worker.
+        calls : of the number of workers: number of a worker, and arguments.
+        combine : makes one result of several, and is told whether that is the last one. They are combined on the
+            workers, in a tree whose order is fixed; one result is returned.
+
+        Raises
+        ------
+        Lost : workers were lost too often, or there are none. What a function raised is raised here.
+        """
+        why = ""
+        for _ in range(TRIES):
+            workers = self._wait_for_workers()
+            given: list[Any] = []
+            try:
+                last = self._submit(
+                    workers, function, self._held(workers, kept), shared, calls(len(workers)), combine, given
+                )
+                if self._done(last, {worker.address for worker in workers}):
+                    return _checked(self.client.gather(last))
+                why = "a worker was lost"
+            except (OSError, CancelledError, self._killed()) as error:
+                why = one_line(error)
+            self._last = self._kept = None
+            with suppress(OSError, CancelledError):
+                self.client.cancel(given, force=True)
+            log.warning("%s; the work that was in progress is done again", why)
+        raise Lost(f"workers were lost {TRIES} times in a row, the last time: {why}; have they enough memory?")
+
+    def _submit(
+        self,
+        workers: Sequence[Worker],
+        function: Callable[..., Any],
+        kept: Any,
+        shared: Any,
+        calls: Iterable[tuple[int, tuple]],
+        combine: Callable[[list, bool], Any] | None,
+        given: list[Any],
+    ) -> list[Any]:
+        def submit(task: Callable, *arguments: Any, at: Sequence[Worker]) -> Any:
+            given.append(
+                self.client.submit(task, *arguments, pure=False, workers=[worker.address for worker in at], retries=0)
+            )
+            return given[-1]
+
+        calls = list(calls)
+        # A future among the arguments stands for its result.
+        here = submit(_same, (_identity(), shared), at=[workers[calls[0][0]]])
+        found = [
+            submit(_perform, self.threads, workers[i].share, function, kept, here, *arguments, at=[workers[i]])
+            for i, arguments in calls
+        ]
+        while combine is not None:
+            last = len(found) <= FAN
+            groups = [found[i : i + FAN] for i in range(0, len(found), FAN)]
+            found = [submit(_combined, combine, group, last, at=workers) for group in groups]
+            if last:
+                break
+        return found
+
+    def _held(self, workers: Sequence[Worker], thing: Any) -> Any:
+        """The future of a thing that is kept, as long as the same workers are there."""
+        addresses = [worker.address for worker in workers]
+        if self._kept is None or self._kept[0] != addresses or self._kept[1] is not thing:
+            # As the result of a task: scattered data would be gone with its worker.
+            self._kept = addresses, thing, self.client.submit(_same, thing, pure=False, workers=addresses)
+        return self._kept[2]
+
+    def _done(self, futures: Sequence[Any], addresses: set[str]) -> bool:
+        """Wait. False: a worker was lost that may have had something to do with it."""
+        from distributed import wait
+
+        while True:
+            with suppress(asyncio.TimeoutError), self.client.as_current():
+                wait(futures, timeout=POLL)
+                return True
+            if not addresses <= {worker.address for worker in self.present()}:
+                return False
+
+    # ---------------------- Who is there ----------------------
+
+    def present(self) -> list[Worker]:
+        """Workers that have given a sign of life. Lost : the scheduler is gone."""
+        if self.client.status != "running":
+            raise Lost(f"the scheduler at {self._address()} is gone; start a cluster, and resume")
+        try:
+            found = self.client.run_on_scheduler(_list_workers)
+        except (OSError, CancelledError, asyncio.TimeoutError) as error:
+            raise Lost(
+                f"the scheduler at {self._address()} is gone: {one_line(error)}; start a cluster, and resume"
+            ) from None
+        return [worker for worker in found if worker.silent < SILENT]
+
+    def _address(self) -> str:
+        return self.client.scheduler.address if self.client.scheduler is not None else "an unknown place"
+
+    def _wait_for_workers(self) -> list[Worker]:
+        began = time.monotonic()
+        if self._last and began - self._last[0] < POLL:
+            return self._last[1]
+        while not (found := self.present()):
+            if time.monotonic() - began > PATIENCE:
+                raise Lost(f"the cluster has had no worker for {PATIENCE:.0f} s; start some, and resume")
+            time.sleep(POLL / 4)
+        self._last = began, found
+        return found
+
+    @staticmethod
+    def _killed() -> type[Exception]:
+        from distributed import KilledWorker
+
+        return KilledWorker
+
+
+def _checked(results: Sequence[Any]) -> list[Any]:
+    for result in results:
+        if isinstance(result, Failure):
+            raise result.error
+    return list(results)
+
+
+# ------------------------------------------------------------------ on the scheduler
+
+
+def _list_workers(dask_scheduler: Any) -> list[Worker]:
+    states = list(dask_scheduler.workers.values())
+    hosts = [state.host for state in states]
+    now = time.time()
+    found = [Worker(s.address, str(s.name), hosts.count(s.host), now - s.last_seen) for s in states]
+    return sorted(found, key=lambda worker: worker.name)
+
+
+# ------------------------------------------------------------------ on workers
+
+
+def _same(thing: Any) -> Any:
+    return thing
+
+
+@dataclass(frozen=True)
+class Identity:
+    """host, process : where it is. versions : of what computes."""
+
+    host: str
+    process: int
+    versions: Mapping[str, str]
+
+
+def _identity() -> Identity:
+    versions = {"Rimlight": rimlight.__version__, "Mitsuba": mi.__version__, "Dr.Jit": dr.__version__}
+    return Identity(socket.gethostname(), os.getpid(), versions)
+
+
+def _refuse(other: Identity) -> None:
+    """Raises Refusal: this worker cannot work for the process that asks."""
+    here = _identity()
+    for name, version in here.versions.items():
+        if version != other.versions[name]:
+            raise Refusal(f"this worker has {name} {version}, the fit {other.versions[name]}; install the same")
+    if (here.host, here.process) == (other.host, other.process):
+        raise Refusal(
+            "a worker is a thread of the fit's own process; Dr.Jit needs processes, such as "
+            "LocalCluster(processes=True)"
+        )
+
+
+#: The one thread of this process that renders, however many Dask gives it; and how many threads of Dr.Jit work for it.
+_renders: tuple[ThreadPoolExecutor, int] | None = None
+
+
+def _thread(threads: int | None, share: int) -> ThreadPoolExecutor:
+    """How many threads work for it is decided once: what Dr.Jit has recorded ends the process if it is replayed with
+    another number. Raises Refusal: the fit asks for another number."""
+    from dask.system import CPU_COUNT  # what the control group of this process allows
+
+    global _renders
+    if _renders is None:
+        count = threads or max(CPU_COUNT // share, 1)
+        dr.set_thread_count(count)
+        _renders = ThreadPoolExecutor(1, thread_name_prefix="rimlight"), count
+    pool, count = _renders
+    if threads not in (None, count):
+        raise Refusal(
+            f"this worker has {count} threads since its first task, and the fit asks for {threads}; restart it"
+        )
+    return pool
+
+
+def _perform(
+    threads: int | None,
+    share: int,
+    function: Callable[..., Any],
+    kept: Any,
+    here: tuple[Identity, Any],
+    *arguments: Any,
+) -> Any:
+    """Do a task on a worker. share : how many workers this machine has."""
+    other, shared = here
+    try:
+        _refuse(other)
+        return _thread(threads, share).submit(function, kept, shared, *arguments).result()
+    except (InputError, Refusal, OSError) as error:
+        kind = next(kind for kind in (InputError, Refusal, OSError) if isinstance(error, kind))
+        return Failure(kind(f"{error} (said by the worker {socket.gethostname()}, process {os.getpid()})"))
+    except Exception as error:
+        return Failure(error)
+
+
+def _combined(combine: Callable[[list, bool], Any], parts: list[Any], last: bool) -> Any:
+    failed = [part for part in parts if isinstance(part, Failure)]
+    return failed[0] if failed else combine(parts, last)
