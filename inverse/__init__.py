@@ -18,6 +18,7 @@ from .report import write, write_report
 from .result import Result, ViewOfFit
 from .torch_bridge import torch_loss, torch_render
 from .watching import Watch
+from .workers import Workers
 
 __all__ = [
     "Cluster",
@@ -33,6 +34,7 @@ __all__ = [
     "Target",
     "ViewOfFit",
     "Watch",
+    "Workers",
     "drjit_loss",
     "fit",
     "prior",

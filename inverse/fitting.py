@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from rimlight.loading import InputError
 
-from . import free_parameters, progress, sources
+from . import batches, free_parameters, progress, sources
 from . import problem as problems
 from . import result as results
 from .executors import Executor, Here
@@ -28,10 +28,9 @@ from .optimisers import Optimiser
 from .problem import Problem
 from .progress import Progress, Segment, Step
 from .regularisers import Regulariser
-from .renderer import Renderer, Task, alone
+from .renderer import Renderer, alone
 from .result import WINDOW, Result
 from .tensorboard import TensorBoard
-from .view import derived_seed
 from .workers import Lost
 
 log = logging.getLogger(__name__)
@@ -140,6 +139,7 @@ class Fit:
         self.progress = Progress()
         self.before: np.ndarray | None = None
         self.image: np.ndarray | None = None
+        self._seen: set[int] = set()  # targets that have been compared
         self.shows: Callable[[], bool] = lambda: False
         self._began: float | None = None
         self._before = 0.0
@@ -230,7 +230,9 @@ class Fit:
         stage = segment.stage
         attached = self.optimiser.values()
         values = {key: to_numpy(value) for key, value in attached.items()}
-        tasks = self._tasks(segment)
+        new = set(batches.views(self.problem, now.step)) - self._seen
+        tasks = batches.tasks(self.problem, now.step, segment, doubt=new, show=self.shows())
+        self._seen |= new
         found = self.executor.gradient(values, tasks)
         loss = float(np.mean([found.losses[task.key] for task in tasks]))
         gradients: dict[str, Any] = {key: found.gradients.get(key, np.float32(0)) / len(tasks) for key in values}
@@ -258,29 +260,14 @@ class Fit:
         step = Step(now.step, segment.number, now.iteration, loss, metrics, errors, rate, not good)
         now.step += 1
         now.iteration += 1
-        if now.step == WINDOW:
+        if now.step == WINDOW * -(
+            -len(self.problem.target) // (self.problem.views_per_step or len(self.problem.target))
+        ):
             for name in self.silent():
                 log.warning('"%s" has no influence on the pictures: its gradient is 0', name)
         if now.iteration >= stage.iterations or self._stalls():
             self._next_segment()
         return step
-
-    def _tasks(self, segment: Segment) -> list[Task]:
-        """What a step renders."""
-        step, stage, shows = self.progress.step, segment.stage, self.shows()
-        return [
-            Task(
-                target=i,
-                width=stage.resolution,
-                spp=stage.spp,
-                seed=derived_seed(self.problem.seed, step, i, part),
-                stage=segment.number,
-                doubt=step == 0 and part == 0,
-                show=i == 0 and part == 0 and shows,
-            )
-            for i in range(len(self.problem.target))
-            for part in range(self.problem.parts)
-        ]
 
     def _show(self, image: np.ndarray) -> None:
         """Keep the first and the last picture of the first view that have the present size, for who watches."""
@@ -449,6 +436,7 @@ class Fit:
         with alone(self.problem.variant):
             self.progress = now
             self.optimiser.restore(optimiser)
+            self._seen = set(range(len(self.problem.target)))
         self.status, self._began = "running", None
 
     def _save(self) -> None:

@@ -56,6 +56,7 @@ class View:
                 f"fit: target.{number}: the film is cropped, so that its resolution cannot change; leave out "
                 "resolution in the stages, or the crop in the scene"
             )
+        self._memory: dict[Any, tuple[float, float]] = {}  # size of the film -> what `_measured` says
         self.functions: dict[Any, tuple[Callable, Callable]] = {}
         self._smaller: tuple[tuple[np.ndarray, np.ndarray], tuple[int, int]] | None = None
         self._picture: tuple[np.ndarray, np.ndarray] | None = None
@@ -188,9 +189,12 @@ class View:
     # ---------------------- Rendering ----------------------
 
     def render(self, seed: int, spp: int) -> np.ndarray:
-        image, _ = self._functions(spp)
+        """A picture: (H, W, C)."""
+        passes = self._passes(spp)
+        image, _ = self._functions(spp // passes)
         with no_collection():
-            return self._colours(np.array(image(self.scene, self.integrator, dr.opaque(mi.UInt32, seed))))
+            parts = [np.array(image(self.scene, self.integrator, s)) for s in _seeds(seed, passes)]
+        return self._colours(np.mean(parts, 0) if passes > 1 else parts[0])
 
     def _colours(self, image: np.ndarray) -> np.ndarray:
         """What is compared, of a picture: (H, W, 1 | 3). Texture coordinates have a third channel of zeros."""
@@ -205,14 +209,51 @@ class View:
         return slice(part.start, part.stop - 1) if self.alpha and self.shows_light else part
 
     def backward(self, by_pixel: np.ndarray, seed: int, spp: int) -> None:
-        _, derivative = self._functions(spp)
+        """Derivatives with respect to what carries a gradient. by_pixel : (H, W, C), of the loss."""
+        passes = self._passes(spp)
+        _, derivative = self._functions(spp // passes)
         part = self._part()
         whole = np.zeros((*by_pixel.shape[:2], self._channels), np.float32)
         whole[..., part] = by_pixel[..., : part.stop - part.start]
-        weight = mi.TensorXf(whole) * dr.opaque(mi.Float, 1)
+        weight = mi.TensorXf(whole / passes) * dr.opaque(mi.Float, 1)
         dr.eval(weight)
         with no_collection():
-            derivative(self.scene, self.integrator, weight, dr.opaque(mi.UInt32, seed))
+            for s in _seeds(seed, passes):
+                derivative(self.scene, self.integrator, weight, s)
+
+    def _passes(self, spp: int) -> int:
+        """In how many launches samples are taken, so that they need no more memory than they may: a divisor of spp.
+
+        Raises
+        ------
+        InputError : one sample per pixel needs more.
+        """
+        if self.problem.max_memory is None:
+            return 1
+        size = tuple(self.sensor.film().crop_size())
+        if size not in self._memory:
+            self._memory[size] = self._measured()
+        before, each = self._memory[size]
+        most = int((self.problem.max_memory - before) / each)
+        if most < 1:
+            raise InputError(
+                f"fit: max_memory is {self.problem.max_memory:g} MB, but one sample per pixel of target "
+                f"{self.number} at {size[0]} x {size[1]} needs {before + each:.0f} MB; use a smaller resolution"
+            )
+        return next(n for n in range(1, spp + 1) if spp % n == 0 and spp // n <= most)
+
+    def _measured(self) -> tuple[float, float]:
+        """Memory that Dr.Jit uses before a launch, and more for each sample per pixel; MB."""
+        image, derivative = self._functions(1)
+        backend, none = dr.backend_v(mi.Float), dr.opaque(mi.UInt32, 0)
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        before = dr.detail.malloc_watermark(backend)
+        with no_collection():
+            shape = np.shape(image(self.scene, self.integrator, none))
+            weight = mi.TensorXf(np.zeros(shape, np.float32)) * dr.opaque(mi.Float, 1)
+            derivative(self.scene, self.integrator, weight, none)
+        return before / 1e6, (dr.detail.malloc_watermark(backend) - before) / 1e6
 
     def forward(self, change: Mapping[str, tuple[mi.Float, np.ndarray]], seed: int, spp: int) -> np.ndarray:
         """Derivative image. change : key -> what `set` returned, and its derivative."""
@@ -258,6 +299,12 @@ class View:
         problem = self.problem
         possible = hasattr(self.integrator, "find_boundaries") or problem.integrator["type"] in REPLAYED
         return problem.freeze and possible and self.sensor.class_name() not in NOT_REPLAYED
+
+
+def _seeds(seed: int, passes: int) -> list[mi.UInt32]:
+    """Of several launches. One has the seed itself."""
+    numbers = [derived_seed(seed, i) for i in range(passes)] if passes > 1 else [seed]
+    return [dr.opaque(mi.UInt32, number) for number in numbers]
 
 
 def derived_seed(*numbers: int) -> int:

@@ -107,6 +107,12 @@ class Workers:
         for opened in self._mine:
             opened.close()
 
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
     # ---------------------- Work ----------------------
 
     def run(

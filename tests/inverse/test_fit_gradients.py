@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from rimlight.inverse import result as results
 from rimlight.inverse.fitting import Fit
 from rimlight.inverse.optimisers import inner_product
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
-from rimlight.inverse.renderer import Renderer, Task
+from rimlight.inverse.renderer import Gradient, Renderer, Task
 
 ROOM = """<scene version="3.0.0">
     <default name="width" value="24"/>
@@ -247,6 +248,29 @@ def test_gradients_of_several_tasks_are_their_sum(room):
         for key in at:
             total = sum(g.gradients[key] for g in apart)
             np.testing.assert_allclose(together.gradients[key], total, rtol=0, atol=2e-6 * np.abs(total).max())
+
+
+def test_memory_has_a_limit(room):
+    """Samples are rendered in passes; the derivatives are as good."""
+    posed = problem(room, integrator={"type": "prb_edge", "max_depth": 3}, target=Target(spp=16))
+    at = {FLOOR: np.float32([0.3, 0.4, 0.5])}
+
+    def peak(limit: float | None, spp: int) -> tuple[float, Gradient, int]:
+        tested = Renderer(dataclasses.replace(posed, max_memory=limit))
+        tested.gradient(at, [Task(0, None, 1, 0)])
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        found = tested.gradient(at, [Task(0, None, spp, 7)])
+        return dr.detail.malloc_watermark(dr.JitBackend.LLVM) / 1e6, found, tested.views[0]._passes(spp)
+
+    most, whole, _ = peak(None, 64)
+    little, parts, passes = peak(most / 3, 64)
+    assert little <= most / 3 and 3 < passes < 64
+    assert parts.loss == pytest.approx(whole.loss, rel=0.1)
+    expected = whole.gradients[FLOOR]
+    np.testing.assert_allclose(parts.gradients[FLOOR], expected, rtol=0, atol=0.02 * np.abs(expected).max())
+    with pytest.raises(ValueError, match=r"max_memory is 0\.01 MB, but one sample per pixel of target 0 at \d+ x \d+"):
+        peak(0.01, 4)
 
 
 def test_scenes_are_not_freed_while_a_function_is_recorded(room, monkeypatch):

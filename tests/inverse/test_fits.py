@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rimlight import scenes
-from rimlight.inverse import executors, fitting, result
+from rimlight.inverse import batches, executors, fitting, result
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
 from rimlight.inverse.renderer import Gradient
 from rimlight.inverse.result import Result
@@ -110,6 +110,21 @@ def test_stages_have_resolutions_and_rates():
     assert max(moved[5:]) < 0.5 * 0.05 * 1.5 and moved[7] < 0.2 * moved[5]
     np.testing.assert_array_equal(found.segments, 5 * [0] + 4 * [1])
     assert found.views[0].result.shape == (32, 32, 3)
+
+
+def test_steps_of_a_few_views():
+    """Drawn at random, one of each group of neighbours; the same when they are drawn again."""
+    posed = triangles(MATERIAL, target=tuple(Target(spp=4) for _ in range(10)), views_per_step=4, steps=3)
+    drawn = np.array([batches.views(posed, step) for step in range(4000)])
+    assert (np.diff(drawn, axis=1) >= 0).all()
+    shares = np.bincount(drawn.ravel(), minlength=10) / drawn.size
+    np.testing.assert_allclose(shares, 0.1, atol=0.005)  # of 16,000 draws, 0.0024 is one standard error
+    assert batches.views(posed, 7) == batches.views(posed, 7) and len({tuple(row) for row in drawn}) > 50
+    found = fit(posed)
+    assert found.status == "finished" and len(found.views) == 10
+    np.testing.assert_array_equal(fit(posed).losses.round(6), found.losses.round(6))
+    with pytest.raises(ValueError, match="views_per_step is 11, but there are only 10 targets"):
+        dataclasses.replace(posed, views_per_step=11)
 
 
 def test_the_scene_is_left_at_the_result():
