@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import groupby
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -67,23 +66,21 @@ class Cluster:
 
     def gradient(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
         seen: dict[int, int] = {}
-        pieces = []  # neighbouring parts of neighbouring views are neighbours
+        items = []  # neighbouring parts of neighbouring views are neighbours
         for task in tasks:
             part = seen[task.target] = seen.get(task.target, -1) + 1
-            pieces.append(task.target * self.parts + part % self.parts)
-
-        def calls(count: int) -> list[tuple[int, tuple]]:
-            owners = [piece * count // self.pieces for piece in pieces]
-            order = sorted(range(len(tasks)), key=lambda i: owners[i])
-            blocks = groupby(order, key=lambda i: owners[i])
-            return [(owner, ([tasks[i] for i in block],)) for owner, block in blocks]
-
-        (found,) = self.workers.run(_gradient, self._problem, dict(values), calls, _sum)
+            items.append((self._place(task.target, part % self.parts), task))
+        ((_, found),) = self.workers.run(_gradient, self._problem, dict(values), items, _sum)
         return unpacked(found)
 
     def map(self, function: Callable[..., Any], shared: Any, calls: Sequence[tuple]) -> list[Any]:
-        owned = lambda count: [(call[0] * self.parts * count // self.pieces, (function, *call)) for call in calls]
-        return self.workers.run(_map, self._problem, shared, owned)
+        items = [(self._place(call[0]), call) for call in calls]
+        blocks = self.workers.run(_map, self._problem, (function, shared), items)
+        found = {i: result for numbers, results in blocks for i, result in zip(numbers, results, strict=True)}
+        return [found[i] for i in range(len(calls))]
+
+    def _place(self, target: int, part: int = 0) -> float:
+        return (target * self.parts + part) / self.pieces
 
     def close(self) -> None:
         self.workers.close()
@@ -103,14 +100,16 @@ def _renderer(problem: str) -> Renderer:
     return Renderer(problems.from_text(problem))
 
 
-def _map(problem: str, shared: Any, function: Callable[..., Any], *call: Any) -> Any:
-    renderer = _renderer(problem)
+def _map(problem: str, shared: tuple[Callable[..., Any], Any], calls: Sequence[tuple]) -> list[Any]:
+    renderer, (function, of_all) = _renderer(problem), shared
     with alone(renderer.problem.variant):
-        return function(renderer, shared, *call)
+        return [function(renderer, of_all, *call) for call in calls]
 
 
 def _gradient(problem: str, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
-    return packed(_map(problem, values, Renderer.gradient, tasks))
+    renderer = _renderer(problem)
+    with alone(renderer.problem.variant):
+        return packed(renderer.gradient(values, tasks))
 
 
 def _sum(parts: Sequence[Gradient], last: bool) -> Gradient:

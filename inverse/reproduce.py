@@ -138,9 +138,9 @@ def reproduce(
     out.mkdir(parents=True, exist_ok=True)
     jobs = [(name, seed) for name in names for seed in seeds]
     if workers is not None:
-        in_turn = lambda count: [(i % count, job) for i, job in enumerate(jobs)]
-        pairs = workers.run(_outcomes, peer, out.resolve(), in_turn)
-        outcomes = [outcome for pair in pairs for outcome in pair]
+        items = [(i / len(jobs), job) for i, job in enumerate(jobs)]
+        blocks = workers.run(_fits, peer, out.resolve(), items)
+        outcomes = [outcome for _, of_block in blocks for outcome in of_block]
         write_summary(out, outcomes)
         return outcomes
     outcomes = []
@@ -148,6 +148,10 @@ def reproduce(
         outcomes += _outcomes(peer, out, *job, progress)
         write_summary(out, outcomes)
     return outcomes
+
+
+def _fits(peer: bool, out: Path, jobs: Sequence[tuple[str, int]]) -> list[Outcome]:
+    return [outcome for job in jobs for outcome in _outcomes(peer, out, *job)]
 
 
 def _outcomes(peer: bool, out: Path, name: str, seed: int, progress: bool = False) -> list[Outcome]:

@@ -2,7 +2,7 @@
 
 Dask connects the processes, carries functions and arrays, and starts a process anew that dies. Added here: one task at
 a time in a process, whose threads are its share of those of its machine; work belongs to a worker, which remembers what
-it needs for it; and what was given out is given out again, as a whole, if one of its workers is lost.
+it needs for it; and what a lost worker had to do is divided among the others.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import drjit as dr
@@ -38,6 +39,9 @@ PATIENCE = 120.0
 
 #: How often work is given out whose workers were lost.
 TRIES = 5
+
+#: Seconds that others are given after a worker was lost, who may wait for what it held.
+GRACE = 30.0
 
 #: Parts that are added up by one task.
 FAN = 8
@@ -65,6 +69,15 @@ class Failure:
     error: Exception
 
 
+@dataclass(frozen=True)
+class Block:
+    """What a worker has to do: numbers of items, its address, and the future of the result."""
+
+    numbers: list[int]
+    address: str
+    future: Any
+
+
 class Workers:
     """The workers of a Dask cluster.
 
@@ -90,7 +103,7 @@ class Workers:
         self._mine: list[Any] = []
         if isinstance(cluster, int):
             cluster = LocalCluster(
-                n_workers=cluster, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+                n_workers=cluster, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
             )
             self._mine.append(cluster)
         try:
@@ -117,18 +130,19 @@ class Workers:
 
     def run(
         self,
-        function: Callable[..., Any],
+        function: Callable[[Any, Any, list], Any],
         kept: Any,
         shared: Any,
-        calls: Callable[[int], Iterable[tuple[int, tuple]]],
+        items: Sequence[tuple[float, Any]],
         combine: Callable[[list, bool], Any] | None = None,
-    ) -> list[Any]:
-        """Results of `function(kept, shared, *arguments)`, in the order of the calls.
+    ) -> list[tuple[list[int], Any]]:
+        """Results of `function(kept, shared, some items)`, of all items, some at a time, each with their numbers.
 
         function : pure, so that it can be called again.
         kept : the same object in many runs, such as the text of a problem: it travels to each worker once. shared : of
             this run. Both travel from here to one worker, and from worker to worker.
-        calls : of the number of workers: number of a worker, and arguments.
+        items : each with its place, in [0, 1): it belongs to worker number `place * workers`, as long as that one
+            lives. What a lost worker had to do is divided among the others.
         combine : makes one result of several, and is told whether that is the last one. They are combined on the
             workers, in a tree whose order is fixed; one result is returned.
 
@@ -138,53 +152,94 @@ class Workers:
         """
         why = ""
         for _ in range(TRIES):
-            workers = self._wait_for_workers()
             given: list[Any] = []
             try:
-                last = self._submit(
-                    workers, function, self._held(workers, kept), shared, calls(len(workers)), combine, given
-                )
-                if self._done(last, {worker.address for worker in workers}):
-                    return _checked(self.client.gather(last))
+                blocks = self._compute(function, kept, shared, items, given)
+                futures = [block.future for block in blocks]
+                if combine is None:
+                    return list(zip([b.numbers for b in blocks], _checked(self.client.gather(futures)), strict=True))
+                last = self._combine(combine, futures, given)
+                if last is not None:
+                    return [(list(range(len(items))), _checked(self.client.gather([last]))[0])]
                 why = "a worker was lost"
             except (OSError, CancelledError, self._killed()) as error:
                 why = one_line(error)
             self._last = self._kept = None
             with suppress(OSError, CancelledError):
                 self.client.cancel(given, force=True)
-            log.warning("%s; the work that was in progress is done again", why)
+            log.warning("%s; the step is done again", why)
         raise Lost(f"workers were lost {TRIES} times in a row, the last time: {why}; have they enough memory?")
 
-    def _submit(
+    def _compute(
         self,
-        workers: Sequence[Worker],
-        function: Callable[..., Any],
+        function: Callable[[Any, Any, list], Any],
         kept: Any,
         shared: Any,
-        calls: Iterable[tuple[int, tuple]],
-        combine: Callable[[list, bool], Any] | None,
+        items: Sequence[tuple[float, Any]],
         given: list[Any],
-    ) -> list[Any]:
-        def submit(task: Callable, *arguments: Any, at: Sequence[Worker]) -> Any:
-            given.append(
-                self.client.submit(task, *arguments, pure=False, workers=[worker.address for worker in at], retries=0)
-            )
-            return given[-1]
+    ) -> list[Block]:
+        """Blocks that are done, in the order of their items. given : collects futures."""
+        done: list[Block] = []
+        places = {i: place for i, (place, _) in enumerate(items)}
+        for _ in range(TRIES):
+            workers = self._wait_for_workers()
+            kept_there = self._held(workers, kept)
+            owners = {i: int(place * len(workers)) for i, place in places.items()}
+            # A future among the arguments stands for its result.
+            here = self._submit(given, workers[min(owners.values()) :][:1], _same, (_identity(), shared))
+            for owner, block in groupby(sorted(owners, key=lambda i: (owners[i], i)), key=owners.__getitem__):
+                numbers, worker = list(block), workers[owner]
+                some = [items[i][1] for i in numbers]
+                task = self.threads, worker.share, function, kept_there, here, some
+                done.append(Block(numbers, worker.address, self._submit(given, [worker], _perform, *task)))
+            lost = self._wait_for(done, again=len(places) < len(items))
+            if not lost:
+                return sorted(done, key=lambda block: block.numbers)
+            log.warning("a worker was lost; its part of the step is done again")
+            self._last = self._kept = None
+            self.client.cancel([block.future for block in lost], force=True)
+            done = [block for block in done if block not in lost]
+            again = sorted(i for block in lost for i in block.numbers)
+            places = {i: k / len(again) for k, i in enumerate(again)}
+        raise Lost(f"workers were lost {TRIES} times in a step; have they enough memory?")
 
-        calls = list(calls)
-        # A future among the arguments stands for its result.
-        here = submit(_same, (_identity(), shared), at=[workers[calls[0][0]]])
-        found = [
-            submit(_perform, self.threads, workers[i].share, function, kept, here, *arguments, at=[workers[i]])
-            for i, arguments in calls
-        ]
-        while combine is not None:
-            last = len(found) <= FAN
-            groups = [found[i : i + FAN] for i in range(0, len(found), FAN)]
-            found = [submit(_combined, combine, group, last, at=workers) for group in groups]
-            if last:
-                break
-        return found
+    def _submit(self, given: list[Any], at: Sequence[Worker], task: Callable, *arguments: Any) -> Any:
+        where = [worker.address for worker in at]
+        given.append(self.client.submit(task, *arguments, pure=False, workers=where))
+        return given[-1]
+
+    def _wait_for(self, blocks: Sequence[Block], again: bool) -> list[Block]:
+        """Wait until all are done, or some are lost: these. again : was one lost before? Then others may wait for what
+        it held."""
+        from distributed import wait
+
+        began = time.monotonic()
+        while True:
+            with suppress(asyncio.TimeoutError), self.client.as_current():
+                wait([block.future for block in blocks], timeout=POLL)
+                return []
+            addresses = {worker.address for worker in self.present()}
+            lost = {block.address for block in blocks} - addresses
+            keys = [block.future.key for block in blocks]
+            waiting = self.client.run_on_scheduler(_waiting, keys=keys) if lost else []
+            late = again and time.monotonic() - began > GRACE
+            if lost or late:
+                return [
+                    block
+                    for block in blocks
+                    if block.address in lost or block.future.key in waiting or (late and not block.future.done())
+                ]
+
+    def _combine(self, combine: Callable[[list, bool], Any], futures: list[Any], given: list[Any]) -> Any:
+        """The future of one result of all. None: a worker was lost."""
+        workers = self._wait_for_workers()
+        last = False
+        while not last:
+            last = len(futures) <= FAN
+            groups = [futures[i : i + FAN] for i in range(0, len(futures), FAN)]
+            futures = [self._submit(given, workers, _combined, combine, group, last) for group in groups]
+        whole = [Block([], worker.address, futures[0]) for worker in workers]
+        return None if self._wait_for(whole, again=False) else futures[0]
 
     def _held(self, workers: Sequence[Worker], thing: Any) -> Any:
         """The future of a thing that is kept, as long as the same workers are there."""
@@ -193,17 +248,6 @@ class Workers:
             # As the result of a task: scattered data would be gone with its worker.
             self._kept = addresses, thing, self.client.submit(_same, thing, pure=False, workers=addresses)
         return self._kept[2]
-
-    def _done(self, futures: Sequence[Any], addresses: set[str]) -> bool:
-        """Wait. False: a worker was lost that may have had something to do with it."""
-        from distributed import wait
-
-        while True:
-            with suppress(asyncio.TimeoutError), self.client.as_current():
-                wait(futures, timeout=POLL)
-                return True
-            if not addresses <= {worker.address for worker in self.present()}:
-                return False
 
     # ---------------------- Who is there ----------------------
 
@@ -256,6 +300,12 @@ def _list_workers(dask_scheduler: Any) -> list[Worker]:
     now = time.time()
     found = [Worker(s.address, str(s.name), hosts.count(s.host), now - s.last_seen) for s in states]
     return sorted(found, key=lambda worker: worker.name)
+
+
+def _waiting(dask_scheduler: Any, keys: Sequence[str]) -> list[str]:
+    """Of tasks, those whose arguments nobody has: a worker that is lost had them."""
+    tasks = dask_scheduler.tasks
+    return [key for key in keys if key in tasks and tasks[key].state in ("waiting", "no-worker", "released")]
 
 
 # ------------------------------------------------------------------ on workers
@@ -317,16 +367,16 @@ def _thread(threads: int | None, share: int) -> ThreadPoolExecutor:
 def _perform(
     threads: int | None,
     share: int,
-    function: Callable[..., Any],
+    function: Callable[[Any, Any, list], Any],
     kept: Any,
     here: tuple[Identity, Any],
-    *arguments: Any,
+    items: list,
 ) -> Any:
     """Do a task on a worker. share : how many workers this machine has."""
     other, shared = here
     try:
         _refuse(other)
-        return _thread(threads, share).submit(function, kept, shared, *arguments).result()
+        return _thread(threads, share).submit(function, kept, shared, items).result()
     except (InputError, Refusal, OSError) as error:
         kind = next(kind for kind in (InputError, Refusal, OSError) if isinstance(error, kind))
         return Failure(kind(f"{error} (said by the worker {socket.gethostname()}, process {os.getpid()})"))
