@@ -3,6 +3,7 @@ so that the result does not depend on who did the work."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,6 +16,9 @@ from . import problem as problems
 from .problem import Problem
 from .renderer import Gradient, Renderer, Task, alone
 from .workers import Workers
+
+#: Arrays of fewer numbers are not packed.
+WORTH = 1000
 
 
 class Executor(Protocol):
@@ -70,8 +74,8 @@ class Cluster:
         for task in tasks:
             part = seen[task.target] = seen.get(task.target, -1) + 1
             items.append((self._place(task.target, part % self.parts), task))
-        ((_, found),) = self.workers.run(_gradient, self._problem, dict(values), items, _sum)
-        return unpacked(found)
+        ((_, found),) = self.workers.run(_gradient, self._problem, pack(values), items, _sum)
+        return replace(found, gradients=unpack(found.gradients))
 
     def map(self, function: Callable[..., Any], shared: Any, calls: Sequence[tuple]) -> list[Any]:
         items = [(self._place(call[0]), call) for call in calls]
@@ -109,46 +113,60 @@ def _map(problem: str, shared: tuple[Callable[..., Any], Any], calls: Sequence[t
 def _gradient(problem: str, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
     renderer = _renderer(problem)
     with alone(renderer.problem.variant):
-        return packed(renderer.gradient(values, tasks))
+        return _for_journey(renderer.gradient(unpack(values), tasks))
 
 
 def _sum(parts: Sequence[Gradient], last: bool) -> Gradient:
-    total = Gradient.sum(map(unpacked, parts))
-    return packed(total.single() if last else total)
+    total = Gradient.sum(replace(part, gradients=unpack(part.gradients)) for part in parts)
+    return _for_journey(total.single() if last else total)
+
+
+def _for_journey(gradient: Gradient) -> Gradient:
+    return replace(gradient, gradients=pack(gradient.gradients))
 
 
 # ------------------------------------------------------------------ what travels
 
 
 @dataclass(frozen=True)
-class Sparse:
-    """An array of which numbers are 0, such as the texels that no view sees. places : of the others, one bit each."""
+class Packed:
+    """An array without its zeros, such as the texels that no view sees, and with the highest byte of its numbers, sign
+    and exponent, compressed: nothing is lost.
+
+    places : one bit for each number that is not 0, compressed. highest : bytes of these, compressed. others : (bytes of
+    a number − 1, numbers).
+    """
 
     shape: tuple[int, ...]
-    places: np.ndarray
-    numbers: np.ndarray
+    kind: np.dtype
+    places: bytes
+    highest: bytes
+    others: np.ndarray
 
 
-def packed(gradient: Gradient) -> Gradient:
-    """With arrays as `Sparse`, where that is shorter."""
-    return replace(gradient, gradients={key: _packed(array) for key, array in gradient.gradients.items()})
+def pack(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Arrays of floats, for a journey. Short ones stay as they are."""
+    return {key: array if array.size < WORTH else _packed(array) for key, array in arrays.items()}
 
 
-def unpacked(gradient: Gradient) -> Gradient:
-    """The inverse of `packed`."""
-    return replace(gradient, gradients={key: _unpacked(array) for key, array in gradient.gradients.items()})
+def unpack(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The inverse of `pack`."""
+    return {key: _unpacked(array) if isinstance(array, Packed) else array for key, array in arrays.items()}
 
 
-def _packed(array: np.ndarray) -> Any:
-    places = array.ravel() != 0
-    if array.nbytes <= array.size // 8 + 1 + np.count_nonzero(places) * array.itemsize:
-        return array
-    return Sparse(array.shape, np.packbits(places), array.ravel()[places])
+def _packed(array: np.ndarray) -> Packed:
+    kind = array.dtype.newbyteorder("<")
+    flat = array.astype(kind).ravel()
+    places = flat != 0
+    planes = flat[places].view(np.uint8).reshape(-1, kind.itemsize).T
+    compress = lambda part: zlib.compress(part.tobytes(), 1)
+    return Packed(array.shape, kind, compress(np.packbits(places)), compress(planes[-1]), planes[:-1].copy())
 
 
-def _unpacked(array: Any) -> np.ndarray:
-    if isinstance(array, np.ndarray):
-        return array
-    whole = np.zeros(np.prod(array.shape, dtype=int), array.numbers.dtype)
-    whole[np.unpackbits(array.places, count=whole.size).astype(bool)] = array.numbers
-    return whole.reshape(array.shape)
+def _unpacked(packed: Packed) -> np.ndarray:
+    whole = np.zeros(np.prod(packed.shape, dtype=int), packed.kind)
+    bits = np.frombuffer(zlib.decompress(packed.places), np.uint8)
+    planes = np.concatenate([packed.others, [np.frombuffer(zlib.decompress(packed.highest), np.uint8)]])
+    numbers = np.ascontiguousarray(planes.T).view(packed.kind).ravel()
+    whole[np.unpackbits(bits, count=whole.size).astype(bool)] = numbers
+    return whole.reshape(packed.shape)

@@ -78,7 +78,7 @@ class Pointwise:
     def __call__(
         self, image: np.ndarray, target: np.ndarray, weight: np.ndarray
     ) -> tuple[float, np.ndarray, dict[str, float]]:
-        image, target, weight = (np.asarray(a, np.float64) for a in (image, target, weight))
+        # Single precision takes half of the time, a tenth of that of a quick render; sums are in double precision.
         s = self.s(target)
         difference = (image - target) * s
         value, gradient = self._level(difference, weight)
@@ -100,7 +100,7 @@ class Pointwise:
     def _level(self, x: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
         share = weight[..., None] / max(weight.sum() * x.shape[2], 1e-12)
         value, slope = self.ρ(x)
-        return float(np.sum(share * value)), share * slope
+        return float(np.sum(share * value, dtype=np.float64)), share * slope
 
 
 class L1(Pointwise):
