@@ -155,12 +155,12 @@ class Workers:
             given: list[Any] = []
             try:
                 blocks = self._compute(function, kept, shared, items, given)
-                futures = [block.future for block in blocks]
-                if combine is None:
-                    return list(zip([b.numbers for b in blocks], _checked(self.client.gather(futures)), strict=True))
-                last = self._combine(combine, futures, given)
-                if last is not None:
-                    return [(list(range(len(items))), _checked(self.client.gather([last]))[0])]
+                there = {block.address for block in blocks}
+                if combine is not None:
+                    blocks = self._combine(combine, blocks, given)
+                found = self._fetch(blocks, there)
+                if found is not None:
+                    return [(block.numbers, result) for block, result in zip(blocks, found, strict=True)]
                 why = "a worker was lost"
             except (OSError, CancelledError, self._killed()) as error:
                 why = one_line(error)
@@ -186,12 +186,12 @@ class Workers:
             kept_there = self._held(workers, kept)
             owners = {i: int(place * len(workers)) for i, place in places.items()}
             # A future among the arguments stands for its result.
-            here = self._submit(given, workers[min(owners.values()) :][:1], _same, (_identity(), shared))
+            here = self._submit(given, [workers[min(owners.values())].address], _same, (_identity(), shared))
             for owner, block in groupby(sorted(owners, key=lambda i: (owners[i], i)), key=owners.__getitem__):
                 numbers, worker = list(block), workers[owner]
                 some = [items[i][1] for i in numbers]
                 task = self.threads, worker.share, function, kept_there, here, some
-                done.append(Block(numbers, worker.address, self._submit(given, [worker], _perform, *task)))
+                done.append(Block(numbers, worker.address, self._submit(given, [worker.address], _perform, *task)))
             lost = self._wait_for(done, again=len(places) < len(items))
             if not lost:
                 return sorted(done, key=lambda block: block.numbers)
@@ -203,8 +203,7 @@ class Workers:
             places = {i: k / len(again) for k, i in enumerate(again)}
         raise Lost(f"workers were lost {TRIES} times in a step; have they enough memory?")
 
-    def _submit(self, given: list[Any], at: Sequence[Worker], task: Callable, *arguments: Any) -> Any:
-        where = [worker.address for worker in at]
+    def _submit(self, given: list[Any], where: Sequence[str], task: Callable, *arguments: Any) -> Any:
         given.append(self.client.submit(task, *arguments, pure=False, workers=where))
         return given[-1]
 
@@ -230,16 +229,29 @@ class Workers:
                     if block.address in lost or block.future.key in waiting or (late and not block.future.done())
                 ]
 
-    def _combine(self, combine: Callable[[list, bool], Any], futures: list[Any], given: list[Any]) -> Any:
-        """The future of one result of all. None: a worker was lost."""
-        workers = self._wait_for_workers()
-        last = False
+    def _combine(self, combine: Callable[[list, bool], Any], blocks: Sequence[Block], given: list[Any]) -> list[Block]:
+        """One block of all, made by those who have the parts."""
+        where = sorted({block.address for block in blocks})
+        futures, last = [block.future for block in blocks], False
         while not last:
             last = len(futures) <= FAN
             groups = [futures[i : i + FAN] for i in range(0, len(futures), FAN)]
-            futures = [self._submit(given, workers, _combined, combine, group, last) for group in groups]
-        whole = [Block([], worker.address, futures[0]) for worker in workers]
-        return None if self._wait_for(whole, again=False) else futures[0]
+            futures = [self._submit(given, where, _combined, combine, group, last) for group in groups]
+        return [Block(sorted(i for block in blocks for i in block.numbers), "", futures[0])]
+
+    def _fetch(self, blocks: Sequence[Block], there: set[str]) -> list[Any] | None:
+        """The results. None: a worker was lost that may have had one of them. there : addresses of all of these."""
+        found = []
+        for block in blocks:
+            patience = POLL
+            while True:
+                with suppress(asyncio.TimeoutError):
+                    found.append(block.future.result(timeout=patience))
+                    break
+                patience *= 2  # what is long in coming begins anew
+                if not there <= {worker.address for worker in self.present()}:
+                    return None
+        return _checked(found)
 
     def _held(self, workers: Sequence[Worker], thing: Any) -> Any:
         """The future of a thing that is kept, as long as the same workers are there."""

@@ -287,12 +287,13 @@ def mean_step(c: Costs, pieces: int, workers: int, loss: float, steps: int = 400
 
 def model() -> None:
     """Checked with two real workers; then for many, with large pictures."""
-    small = costs()
+    some = tuple(Target(sensor=i, spp=16) for i in range(0, VIEWS, 5))
+    small = costs(target=some)
     print(small)
-    two = measured(2)
+    two = measured(2, target=some)
     # How fast a core is while other cores work, and others use the machine, is not the model's matter.
-    said = mean_step(replace(small, piece=two.gradient / (VIEWS / 2), spread=0), VIEWS, 2, 0)
-    print(f"two workers, {VIEWS} views of {WIDTH}²: {said:.2f} s by the model, {two.step:.2f} s real")
+    said = mean_step(replace(small, piece=two.gradient / (len(some) / 2), spread=0), len(some), 2, 0)
+    print(f"two workers, {len(some)} views of {WIDTH}²: {said:.2f} s by the model, {two.step:.2f} s real")
     few = tuple(Target(sensor=i, spp=4) for i in range(2))
     large = costs(width=1024, target=few, parts=2, stage=Stage(iterations=2 * STEPS, spp=1))
     print(large)

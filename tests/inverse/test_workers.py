@@ -24,6 +24,7 @@ from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Free, Problem, Stage, Target
 from rimlight.inverse.renderer import Gradient
 from rimlight.pictures import write_image
+from rimlight.scenes import turntable
 
 distributed = pytest.importorskip("distributed")
 
@@ -280,3 +281,22 @@ def test_sums_do_not_depend_on_their_order():
     halves = Gradient.sum([Gradient.sum(parts[:37][::-1]), Gradient.sum(parts[37:])]).single()
     np.testing.assert_array_equal(whole.gradients["a"], halves.gradients["a"])
     assert whole.gradients["a"].dtype == np.float32 and whole.losses == halves.losses
+
+
+# ------------------------------------------------------------------ an example
+
+
+@pytest.mark.slow
+def test_the_crate_on_the_turntable(tmp_path):
+    """The example of the docs, much smaller."""
+    example = problems.read(turntable.write(tmp_path))
+    assert len(example.target) == turntable.CAMERAS and example.views_per_step == 6
+    targets = tuple(dataclasses.replace(target, spp=16) for target in example.target[::6])
+    stage = (Stage(iterations=20),)
+    small = dataclasses.replace(example, target=targets, views_per_step=None, define={"res": "24"}, stage=stage)
+    found = inverse.fit(small, progress=False)
+    errors = {label: (e[0], e[-1]) for label, e in found.errors.items()}
+    assert errors["crate: angle (degrees)"][0] == pytest.approx(12, abs=1e-3)
+    assert all(after < before for before, after in errors.values()), errors
+    ratios = [measures["peak signal-to-noise ratio (dB)"] for measures in found.measures]
+    assert all(after > before for before, after in ratios), ratios
