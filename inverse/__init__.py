@@ -8,7 +8,7 @@ found = inverse.fit(problem, out="result")
 inverse.write("result", found, title="My fit")
 """
 
-from .executors import Cluster, Processes
+from .executors import Cluster
 from .fitting import Fit, fit
 from .losses import Loss, LossFunction, drjit_loss
 from .problem import Free, Problem, Stage, Starts, Target, read
@@ -18,6 +18,7 @@ from .report import write, write_report
 from .result import Result, ViewOfFit
 from .torch_bridge import torch_loss, torch_render
 from .watching import Watch
+from .workers import Workers
 
 __all__ = [
     "Cluster",
@@ -26,7 +27,6 @@ __all__ = [
     "Loss",
     "LossFunction",
     "Problem",
-    "Processes",
     "Result",
     "Stage",
     "Starts",
@@ -34,6 +34,7 @@ __all__ = [
     "Target",
     "ViewOfFit",
     "Watch",
+    "Workers",
     "drjit_loss",
     "fit",
     "prior",

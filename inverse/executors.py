@@ -1,134 +1,172 @@
-"""Where gradients are evaluated: here, in other processes, or on other machines. All call one pure function, and add up
-what it returns in the order of the tasks, so that the result does not depend on who did the work."""
+"""Where a fit renders: here, in other processes, or on other machines. All call the same pure functions of a renderer,
+so that the result does not depend on who did the work."""
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
-import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-import drjit as dr
 import numpy as np
-
-from rimlight.edge_sampling.refusals import InputError, Refusal
 
 from . import problem as problems
 from .problem import Problem
-from .renderer import Gradient, Renderer, Task
+from .renderer import Gradient, Renderer, Task, alone
+from .workers import Workers
 
-log = logging.getLogger(__name__)
-
-#: How often a task is tried whose worker died.
-TRIES = 4
-
-
-def evaluate(problem: str, values: Mapping[str, np.ndarray], task: Task) -> Gradient:
-    """Loss and gradient of a task: the pure function.
-
-    problem : as TOML, with absolute paths. The renderer of the last one stays in memory.
-    """
-    return _renderer(problem).gradient(values, task)
+#: Arrays of fewer numbers are not packed.
+WORTH = 1000
 
 
-@lru_cache(maxsize=1)
-def _renderer(problem: str) -> Renderer:
-    return Renderer(problems.from_text(problem))
+class Executor(Protocol):
+    """Renders for a fit."""
+
+    def gradient(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
+        """What `Renderer.gradient` says, in single precision."""
+        ...
+
+    def map(self, function: Callable[..., Any], shared: Any, calls: Sequence[tuple]) -> list[Any]:
+        """Results of `function(renderer, shared, *call)` for each call. A call begins with the number of a target."""
+        ...
 
 
-def _use_threads(count: int) -> None:
-    dr.set_thread_count(count)  # a function of Dr.Jit cannot be sent to a process itself
+class Here:
+    """The renderer of this process."""
 
+    def __init__(self, renderer: Renderer):
+        self.renderer = renderer
 
-def _text(problem: Problem) -> str:
-    text = problems.text(problems.relative_to(problem, Path.cwd()))
-    problems.check_is_text(text)
-    return text
+    def gradient(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
+        return self.renderer.gradient(values, tasks).single()
 
-
-class Processes:
-    """Processes on this machine, started anew (not forked), each with its share of the threads.
-
-    A process that dies is replaced, and its tasks are done again.
-    """
-
-    def __init__(self, problem: Problem, count: int):
-        if count < 1:
-            raise InputError(f"fit: the number of workers must be >= 1, got {count}")
-        self.problem, self.count = _text(problem), count
-        self.pool = self._start()
-
-    def _start(self) -> ProcessPoolExecutor:
-        threads = max((os.cpu_count() or 1) // self.count, 1)
-        return ProcessPoolExecutor(
-            self.count, multiprocessing.get_context("spawn"), initializer=_use_threads, initargs=(threads,)
-        )
-
-    def __call__(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> list[Gradient]:
-        done: dict[int, Gradient] = {}
-        for attempt in range(TRIES):
-            waiting: dict[int, Future] = {}
-            try:
-                for i, task in enumerate(tasks):
-                    if i not in done:
-                        waiting[i] = self.pool.submit(evaluate, self.problem, dict(values), task)
-                for i, future in waiting.items():
-                    done[i] = future.result()
-                return [done[i] for i in range(len(tasks))]
-            except BrokenProcessPool:
-                log.warning("a worker died (%d of %d tries); its tasks are done again", attempt + 1, TRIES)
-                self.close()
-                self.pool = self._start()
-        raise Refusal(f"fit: workers died {TRIES} times in a row; is there enough memory for {self.count} of them?")
-
-    def close(self) -> None:
-        self.pool.shutdown(wait=False, cancel_futures=True)
-
-    def __enter__(self) -> Processes:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()
+    def map(self, function: Callable[..., Any], shared: Any, calls: Sequence[tuple]) -> list[Any]:
+        return [function(self.renderer, shared, *call) for call in calls]
 
 
 class Cluster:
     """Workers of a Dask cluster, which see the files of the problem under the same paths.
 
-    address : of its scheduler, such as "tcp://10.0.0.1:8786"; "local" starts one here.
+    Views belong to workers: neighbours to the same one. Each worker loads its targets only, and sets the parameters of
+    a scene once in a step; sums of gradients travel, and no pictures.
 
-    Dask gives the tasks of a worker that is lost to another one.
+    cluster : how many processes to start on this machine; or the address of a scheduler, such as
+        "tcp://10.0.0.1:8786"; or a cluster of one of Dask's deployers, such as dask_jobqueue's SLURMCluster, or a
+        client of one.
+
+    Raises
+    ------
+    InputError : there is no such cluster, Dask is not installed, or a part of the problem is in memory only.
     """
 
-    def __init__(self, problem: Problem, address: str):
-        try:
-            from dask.distributed import Client
-        except ImportError:
-            raise InputError("fit: a cluster needs the package distributed: pip install 'rimlight[cluster]'") from None
-        self.problem = _text(problem)
-        try:
-            if address == "local":
-                self.client = Client(threads_per_worker=1, dashboard_address=None)
-            else:
-                self.client = Client(address, timeout=20)
-        except (OSError, ValueError) as error:
-            raise InputError(f'fit: no cluster at "{address}": {error}') from None
+    def __init__(self, problem: Problem, cluster: int | str | Any):
+        self._problem = problems.text(problems.relative_to(problem, Path.cwd()))
+        problems.check_is_text(self._problem)
+        self.pieces = len(problem.target) * problem.parts
+        self.parts = problem.parts
+        self.workers = Workers(cluster, problem.threads)
 
-    def __call__(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> list[Gradient]:
-        # As one datum with a name of its own: Dask would name those of a dictionary by its keys, in each step alike.
-        (shared,) = self.client.scatter([dict(values)], broadcast=True, hash=False)
-        waiting = [self.client.submit(evaluate, self.problem, shared, t, pure=False, retries=TRIES) for t in tasks]
-        return self.client.gather(waiting)
+    def gradient(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
+        seen: dict[int, int] = {}
+        items = []  # neighbouring parts of neighbouring views are neighbours
+        for task in tasks:
+            part = seen[task.target] = seen.get(task.target, -1) + 1
+            items.append((self._place(task.target, part % self.parts), task))
+        ((_, found),) = self.workers.run(_gradient, self._problem, pack(values), items, _sum)
+        return replace(found, gradients=unpack(found.gradients))
+
+    def map(self, function: Callable[..., Any], shared: Any, calls: Sequence[tuple]) -> list[Any]:
+        items = [(self._place(call[0]), call) for call in calls]
+        blocks = self.workers.run(_map, self._problem, (function, shared), items)
+        found = {i: result for numbers, results in blocks for i, result in zip(numbers, results, strict=True)}
+        return [found[i] for i in range(len(calls))]
+
+    def _place(self, target: int, part: int = 0) -> float:
+        return (target * self.parts + part) / self.pieces
 
     def close(self) -> None:
-        self.client.close()
+        self.workers.close()
 
     def __enter__(self) -> Cluster:
         return self
 
     def __exit__(self, *_: Any) -> None:
         self.close()
+
+
+# ------------------------------------------------------------------ on workers
+
+
+@lru_cache(maxsize=2)
+def _renderer(problem: str) -> Renderer:
+    return Renderer(problems.from_text(problem))
+
+
+def _map(problem: str, shared: tuple[Callable[..., Any], Any], calls: Sequence[tuple]) -> list[Any]:
+    renderer, (function, of_all) = _renderer(problem), shared
+    with alone(renderer.problem.variant):
+        return [function(renderer, of_all, *call) for call in calls]
+
+
+def _gradient(problem: str, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
+    renderer = _renderer(problem)
+    with alone(renderer.problem.variant):
+        return _for_journey(renderer.gradient(unpack(values), tasks))
+
+
+def _sum(parts: Sequence[Gradient], last: bool) -> Gradient:
+    total = Gradient.sum(replace(part, gradients=unpack(part.gradients)) for part in parts)
+    return _for_journey(total.single() if last else total)
+
+
+def _for_journey(gradient: Gradient) -> Gradient:
+    return replace(gradient, gradients=pack(gradient.gradients))
+
+
+# ------------------------------------------------------------------ what travels
+
+
+@dataclass(frozen=True)
+class Packed:
+    """An array without its zeros, such as the texels that no view sees, and with the highest byte of its numbers, sign
+    and exponent, compressed: nothing is lost.
+
+    places : one bit for each number that is not 0, compressed. highest : bytes of these, compressed. others : (bytes of
+    a number − 1, numbers).
+    """
+
+    shape: tuple[int, ...]
+    kind: np.dtype
+    places: bytes
+    highest: bytes
+    others: np.ndarray
+
+
+def pack(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Arrays of floats, for a journey. Short ones stay as they are."""
+    return {key: array if array.size < WORTH else _packed(array) for key, array in arrays.items()}
+
+
+def unpack(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The inverse of `pack`."""
+    return {key: _unpacked(array) if isinstance(array, Packed) else array for key, array in arrays.items()}
+
+
+def _packed(array: np.ndarray) -> Packed:
+    kind = array.dtype.newbyteorder("<")
+    flat = array.astype(kind).ravel()
+    places = flat != 0
+    planes = flat[places].view(np.uint8).reshape(-1, kind.itemsize).T
+    compress = lambda part: zlib.compress(part.tobytes(), 1)
+    return Packed(array.shape, kind, compress(np.packbits(places)), compress(planes[-1]), planes[:-1].copy())
+
+
+def _unpacked(packed: Packed) -> np.ndarray:
+    whole = np.zeros(np.prod(packed.shape, dtype=int), packed.kind)
+    bits = np.frombuffer(zlib.decompress(packed.places), np.uint8)
+    planes = np.concatenate([packed.others, [np.frombuffer(zlib.decompress(packed.highest), np.uint8)]])
+    numbers = np.ascontiguousarray(planes.T).view(packed.kind).ravel()
+    whole[np.unpackbits(bits, count=whole.size).astype(bool)] = numbers
+    return whole.reshape(packed.shape)

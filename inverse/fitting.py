@@ -19,17 +19,19 @@ from tqdm import tqdm
 
 from rimlight.loading import InputError
 
-from . import free_parameters, progress, sources, targets
+from . import batches, free_parameters, progress, sources
 from . import problem as problems
 from . import result as results
+from .executors import Executor, Here
 from .free_parameters import to_numpy
 from .optimisers import Optimiser
 from .problem import Problem
 from .progress import Progress, Segment, Step
 from .regularisers import Regulariser
-from .renderer import Gradient, Renderer, Task, alone, derived_seed
+from .renderer import Renderer, alone
 from .result import WINDOW, Result
 from .tensorboard import TensorBoard
+from .workers import Lost
 
 log = logging.getLogger(__name__)
 
@@ -44,9 +46,6 @@ INTERVAL = 5.0
 
 #: Pictures of an animation.
 FRAMES = 48
-
-#: Evaluates tasks, in their order.
-Executor = Callable[[Mapping[str, np.ndarray], Sequence[Task]], list[Gradient]]
 
 
 def fit(problem: Problem, *, progress: bool = True, **options: Any) -> Result:
@@ -64,7 +63,7 @@ class Fit:
     resume : go on from the checkpoint in `out`. With one thread (`Problem.threads`) the result is bit by bit that of
         a fit that was not interrupted, if each is the only one of its process; with several, sums of gradients differ
         in their last bits, in any two runs alike.
-    executor : evaluates gradients elsewhere. Default: here, one after the other.
+    executor : renders elsewhere, such as a `Cluster`. Default: here.
     tensorboard : write loss and errors into `out` for TensorBoard. Needs the package tensorboardX.
     regularisers : functions of the fitted scene parameters that are added to the loss; see `regularisers`.
     on_step : functions that are called with the `Step` after each one. The method of the same name adds more of them.
@@ -73,6 +72,7 @@ class Fit:
     Attributes
     ----------
     status : "running", and at the end "finished", "interrupted", "out of time", or why it stopped or gave up.
+    shows : says whether a step shall keep the picture of the first view, for who watches.
 
     Raises
     ------
@@ -123,16 +123,14 @@ class Fit:
         if problem.threads is not None:
             dr.set_thread_count(problem.threads)
         self.renderer = Renderer(problem)
+        self.executor: Executor = executor or Here(self.renderer)
         self.fingerprints = sources.fingerprints(problem, self.renderer.scenes)
         # Stages of one resolution and loss need one check.
         distinct = {(s.resolution, id(n)): i for i, (s, n) in enumerate(zip(problem.stage, problem.norms, strict=True))}
-        for view in self.renderer.views:
-            for stage in distinct.values():
-                view.check(stage)
+        self.executor.map(Renderer.check, list(distinct.values()), [(i,) for i in range(len(problem.target))])
         self.parameters = free_parameters.find(problem.free, self.renderer.params)
         self.truth_is_known = problem.compares and all(target.file is None for target in problem.target)
         self.optimiser = Optimiser(self.parameters, problem)
-        self.executor: Executor = executor or (lambda values, tasks: [self.renderer.gradient(values, t) for t in tasks])
         self.start = self.latents()
         stages, starts = list(enumerate(problem.stage)), problem.starts.count
         explored = [Segment(*stages[0], k) for k in range(starts)] if starts > 1 else [Segment(*stages[0])]
@@ -141,6 +139,8 @@ class Fit:
         self.progress = Progress()
         self.before: np.ndarray | None = None
         self.image: np.ndarray | None = None
+        self._seen: set[int] = set()  # targets that have been compared
+        self.shows: Callable[[], bool] = lambda: False
         self._began: float | None = None
         self._before = 0.0
         self._saved, self._cost = 0.0, 0.0  # when the last checkpoint was written, and how long that took, seconds
@@ -168,7 +168,12 @@ class Fit:
         """Take the steps that are left, one by one. A checkpoint is written now and then, and when the loop is left."""
         self._clock_starts()
         while self.status == "running" and self.progress.segment < len(self.plan):
-            step = self.step()
+            try:
+                step = self.step()
+            except Lost as error:
+                self.stop(f"stopped: {error}")
+                self.executor = Here(self.renderer)  # for the pictures of the result
+                break
             self._settle()
             try:
                 yield step
@@ -225,25 +230,23 @@ class Fit:
         stage = segment.stage
         attached = self.optimiser.values()
         values = {key: to_numpy(value) for key, value in attached.items()}
-        tasks = [
-            Task(i, stage.resolution, stage.spp, derived_seed(self.problem.seed, now.step, i, part), segment.number)
-            for i in range(len(self.problem.target))
-            for part in range(self.problem.parts)
-        ]
-        found = self.executor(values, tasks)
-        loss = float(np.mean([f.loss for f in found]))
-        gradients: dict[str, Any] = {
-            key: sum((f.gradients[key] for f in found if key in f.gradients), np.float32(0)) / len(found)
-            for key in values
-        }
+        new = set(batches.views(self.problem, now.step)) - self._seen
+        tasks = batches.tasks(self.problem, now.step, segment, doubt=new, show=self.shows())
+        self._seen |= new
+        found = self.executor.gradient(values, tasks)
+        loss = float(np.mean([found.losses[task.key] for task in tasks]))
+        gradients: dict[str, Any] = {key: found.gradients.get(key, np.float32(0)) / len(tasks) for key in values}
         penalty = self._penalty(attached)
         if penalty is not None:
             loss += float(np.array(dr.detach(penalty)).item())
-        metrics = {label: float(np.mean([f.scores[label] for f in found])) for label in found[0].scores}
-        if now.step == 0:
-            self._doubt({task.target: f.image for task, f in zip(tasks, found, strict=True)})
+        scores = [found.scores[task.key] for task in tasks]
+        metrics = {label: float(np.mean([of_task[label] for of_task in scores])) for label in scores[0]}
+        for text in found.doubts.values():
+            now.doubts.append(text)
+            log.warning("%s", text)
         self._note(loss, metrics)
-        self._show(found[0].image)
+        if found.image is not None:
+            self._show(found.image)
         errors = {label: known[-1] for label, known in now.errors.items()}
         rate = stage.factor(now.iteration)
         good = bool(np.isfinite(loss)) and all(np.isfinite(g).all() for g in gradients.values())
@@ -257,7 +260,9 @@ class Fit:
         step = Step(now.step, segment.number, now.iteration, loss, metrics, errors, rate, not good)
         now.step += 1
         now.iteration += 1
-        if now.step == WINDOW:
+        if now.step == WINDOW * -(
+            -len(self.problem.target) // (self.problem.views_per_step or len(self.problem.target))
+        ):
             for name in self.silent():
                 log.warning('"%s" has no influence on the pictures: its gradient is 0', name)
         if now.iteration >= stage.iterations or self._stalls():
@@ -283,14 +288,6 @@ class Fit:
     def silent(self) -> list[str]:
         """Names of parameters whose gradient was always 0."""
         return [p.name for p in self.parameters if p.name not in self.progress.touched]
-
-    def _doubt(self, found: Mapping[int, np.ndarray]) -> None:
-        """Say what may make no sense. found : number of a target -> what was first rendered to compare with it."""
-        for number, image in found.items() if self.problem.compares else ():
-            view = self.renderer.views[number]
-            if view.shows_light and (doubts := targets.doubts(image, *view.target_at(image.shape[:2]))):
-                self.progress.doubts.append(f"Target {number} " + "; it ".join(doubts) + ".")
-                log.warning("%s", self.progress.doubts[-1])
 
     def _note(self, loss: float, metrics: Mapping[str, float]) -> None:
         """Keep what is known before a step."""
@@ -385,7 +382,12 @@ class Fit:
     def result(self) -> Result:
         """What the fit found: the best state so far, or the last one if it is finished, with pictures."""
         with alone(self.problem.variant):
-            return results.of(self)
+            try:
+                return results.of(self)
+            except Lost as error:
+                log.warning("%s; the pictures of the result are rendered by this process", error)
+                self.executor = Here(self.renderer)
+                return results.of(self)
 
     def _shown(self) -> dict[str, str]:
         now = self.progress
@@ -434,6 +436,7 @@ class Fit:
         with alone(self.problem.variant):
             self.progress = now
             self.optimiser.restore(optimiser)
+            self._seen = set(range(len(self.problem.target)))
         self.status, self._began = "running", None
 
     def _save(self) -> None:

@@ -78,7 +78,7 @@ class Pointwise:
     def __call__(
         self, image: np.ndarray, target: np.ndarray, weight: np.ndarray
     ) -> tuple[float, np.ndarray, dict[str, float]]:
-        image, target, weight = (np.asarray(a, np.float64) for a in (image, target, weight))
+        # Single precision takes half of the time, a tenth of that of a quick render; sums are in double precision.
         s = self.s(target)
         difference = (image - target) * s
         value, gradient = self._level(difference, weight)
@@ -100,7 +100,7 @@ class Pointwise:
     def _level(self, x: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
         share = weight[..., None] / max(weight.sum() * x.shape[2], 1e-12)
         value, slope = self.ρ(x)
-        return float(np.sum(share * value)), share * slope
+        return float(np.sum(share * value, dtype=np.float64)), share * slope
 
 
 class L1(Pointwise):
@@ -285,8 +285,8 @@ def root_mean_square(difference: np.ndarray, weight: np.ndarray) -> float:
 
 
 def measures(image: np.ndarray, target: np.ndarray, weight: np.ndarray, light: bool = True) -> dict[str, float]:
-    """How alike two pictures are, for people: root mean square error, structural similarity, and the mean colour
-    difference ΔE of CIE 2000, where there is colour.
+    """How alike two pictures are, for people: root mean square error, peak signal-to-noise ratio in sRGB, structural
+    similarity, and the mean colour difference ΔE of CIE 2000, where there is colour.
 
     image, target : (H, W, C), linear radiance, of which 1 is white; unless `light`, other numbers, of which the first
         is all that is told. weight : (H, W).
@@ -300,6 +300,8 @@ def measures(image: np.ndarray, target: np.ndarray, weight: np.ndarray, light: b
     share = weight / max(weight.sum(), 1e-12)
     found = {"root mean square error": root_mean_square(image - target, weight)}
     shown, wanted = (pictures.to_srgb(a) for a in (image, target))
+    apart = root_mean_square((shown.astype(np.float32) - wanted) / 255, weight)
+    found["peak signal-to-noise ratio (dB)"] = -20 * np.log10(max(apart, 1e-6)).item()
     if min(image.shape[:2]) >= 7:
         _, similarity = structural_similarity(shown, wanted, channel_axis=2, full=True)
         found["structural similarity"] = float(np.sum(share * similarity.mean(2)))

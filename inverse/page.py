@@ -42,6 +42,8 @@ p { max-width: 46rem; margin: .4rem 0 .8rem; }
 img, video, svg { max-width: 100%; height: auto; display: block; }
 figure { margin: 0; min-width: 0; max-width: 100%; }
 figcaption { color: var(--quiet); font-size: .85rem; margin: .3rem 0; }
+.thumbs { display: flex; gap: 2px; }
+.thumbs img { width: 6rem; }
 .pixels { image-rendering: pixelated; }
 .verdict { max-width: none; font-size: 1.05rem; }
 .status { color: var(--good); font-weight: 600; }

@@ -183,6 +183,12 @@ class Problem:
     parts: int = 1
     """Number of independent renders of each target in a step. Their losses and gradients are averaged. Several
     processes or machines can share them."""
+    views_per_step: int | None = None
+    """Number of targets that a step compares. They are drawn at random, one of each of so many groups of neighbours.
+    Default: all."""
+    max_memory: float | None = None
+    """Memory that Dr.Jit may use in a process, in MB. Samples beyond it are rendered one after the other. Default: no
+    limit."""
     seed: int = 0
     """Random seed."""
     patience: int | None = None
@@ -236,9 +242,13 @@ def check(problem: Problem) -> None:
         raise InputError("fit: nothing is free, add a table [[free]]")
     if not problem.target or not problem.stage:
         raise InputError("fit: a fit needs at least one target and one stage")
-    at_least = {"parts": 1, "seed": 0, "threads": 1, "max_bad": 1, "patience": 1, "seconds": 0}
+    if problem.views_per_step is not None and problem.views_per_step > len(problem.target):
+        raise InputError(
+            f"fit: views_per_step is {problem.views_per_step}, but there are only {len(problem.target)} targets"
+        )
+    at_least = {"parts": 1, "views_per_step": 1, "seed": 0, "threads": 1, "max_bad": 1, "patience": 1, "seconds": 0}
     _at_least("", problem, at_least)
-    _positive("", problem, ("clip",))
+    _positive("", problem, ("clip", "max_memory"))
     for name in ("momentum", "smooth_scale"):
         if not 0 <= getattr(problem, name) < 1:
             raise InputError(f"fit: {name} must be in [0, 1), got {getattr(problem, name)}")

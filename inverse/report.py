@@ -27,13 +27,17 @@ from . import page
 from . import problem as problems
 from .animation import goal, write_animation
 from .page import number
-from .result import WINDOW, Result, summary
+from .result import WINDOW, Result, ViewOfFit, summary
 
 #: Parameters of so few numbers are shown number by number.
 FEW = 16
 
 #: Curves of one plot.
 CURVES = 12
+
+#: Of more views than so, the first one and the worst ones are shown in detail, so many in all; and all as thumbnails of
+#: this width, pixels.
+DETAILED, THUMBNAIL = 4, 96
 
 
 def write(folder: Path, result: Result, *, title: str) -> None:
@@ -60,7 +64,7 @@ def write(folder: Path, result: Result, *, title: str) -> None:
     attempt(lambda: _write_text(folder / "result.json", summary(result) + "\n"))
     attempt(lambda: _write_values(folder / "result.npz", result.values))
     attempt(lambda: problems.write(folder / "problem.toml", result.problem))
-    attempt(lambda: _write_page(folder / "report.html", result, write_animation(folder, result), title, ""))
+    attempt(lambda: _write_page(folder / "report.html", result, write_animation(folder, result), title, beside=True))
     for i, view in enumerate(result.views):
         for name, image in (("start", view.start), ("result", view.result), ("target", view.target)):
             path = folder / f"{name}_{i}"
@@ -112,10 +116,13 @@ def write_report(path: Path, result: Result, *, title: str, text: str = "") -> N
         _write_page(Path(path), result, write_animation(Path(folder), result), title, text)
 
 
-def _write_page(path: Path, result: Result, animation: Path, title: str, text: str) -> None:
+def _write_page(
+    path: Path, result: Result, animation: Path, title: str, text: str = "", *, beside: bool = False
+) -> None:
+    """beside : are the pictures of the views in files beside the page, too?"""
     sections = [
         f"<header>\n<h1>{html.escape(title)}</h1>\n{_verdict(result)}\n{page.paragraphs(text)}\n</header>",
-        _views(result),
+        _views(result, beside),
         _curves(result),
         _parameters(result),
         _animation(animation, result),
@@ -184,10 +191,16 @@ def _name(result: Result, view: int) -> str:
     return "The picture" if len(result.views) == 1 else f"View {view}"
 
 
-def _views(result: Result) -> str:
+def _views(result: Result, beside: bool = False) -> str:
     aim = goal(result)
     sections = [f"<section>\n<h2>Result and {aim}</h2>"]
-    for i, (view, measures) in enumerate(zip(result.views, result.measures, strict=True)):
+    several = len(result.views) > DETAILED
+    for i in _in_detail(result) if several else range(len(result.views)):
+        view, measures = result.views[i], result.measures[i]
+        if several:
+            small = lambda image: page.shrunk(image, page.ENLARGED, page.ENLARGED)
+            weight = small(view.weight[..., None])[..., 0]
+            view = ViewOfFit(small(view.start), small(view.result), small(view.target), weight)
         if len(result.views) > 1:
             sections.append(f"<h3>View {i}</h3>")
         counts = (view.weight > 0)[..., None]
@@ -203,7 +216,34 @@ def _views(result: Result) -> str:
             f'<div class="side">\n{page.table(("", "before", "result"), rows, f"Likeness to the {aim}")}\n'
             f"<h3>Differences</h3>\n{page.differences(panels)}\n</div>\n</div>"
         )
+    if several:
+        sections.append(_overview(result, aim, beside))
     return "\n".join([*sections, "</section>"])
+
+
+def _in_detail(result: Result) -> list[int]:
+    """Numbers of the views that are shown in detail: the first one, and the worst ones."""
+    after = [measures["root mean square error"][1] for measures in result.measures]
+    worst = sorted(range(1, len(after)), key=lambda i: -np.nan_to_num(after[i], nan=np.inf))
+    return [0, *sorted(worst[: DETAILED - 1])]
+
+
+def _overview(result: Result, aim: str, beside: bool) -> str:
+    """All views, small."""
+    figures = []
+    for i, (view, measures) in enumerate(zip(result.views, result.measures, strict=True)):
+        before, after = (number(x, 2) for x in measures["root mean square error"])
+        shown = "".join(
+            page.picture(page.shrunk(image, THUMBNAIL, THUMBNAIL), f"View {i}: {name}")
+            for name, image in (("result", view.result), (aim, view.target))
+        )
+        name = f'<a href="result_{i}.png">View {i}</a>' if beside else f"View {i}"
+        caption = f"<figcaption>{name}: {before} → {after}</figcaption>"
+        figures.append(f'<figure><div class="thumbs">{shown}</div>{caption}</figure>')
+    return (
+        f"<h3>All views</h3>\n<p>Result and {aim}, and the root mean square error before and after.</p>\n"
+        f'<div class="row">{"".join(figures)}</div>'
+    )
 
 
 def _parameters(result: Result) -> str:

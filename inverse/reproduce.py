@@ -31,6 +31,7 @@ from . import problem as problems
 from .fitting import fit
 from .problem import Problem
 from .result import Result, finite
+from .workers import Workers
 
 log = logging.getLogger(__name__)
 
@@ -108,12 +109,19 @@ def problem_of(name: str, folder: Path | None = None) -> Problem:
 
 
 def reproduce(
-    figure: str, out: Path, *, seeds: Sequence[int] = range(5), peer: bool = False, progress: bool = True
+    figure: str,
+    out: Path,
+    *,
+    seeds: Sequence[int] = range(5),
+    peer: bool = False,
+    progress: bool = True,
+    workers: Workers | None = None,
 ) -> list[Outcome]:
     """Run the experiments of a figure, with a report for each fit, and a summary in `out`.
 
     figure : one of `EXPERIMENTS` or of `FIGURES`; "all" is without fig10 where its packages are missing.
     peer : fit with Mitsuba's `prb_projective`, too, for as long as our fit took.
+    workers : fit there, each fit on one of them. They see `out` under the same path.
 
     Raises
     ------
@@ -132,15 +140,28 @@ def reproduce(
             log.warning("fig10 is left out; %s", error)
             names = [name for name in names if name != "fig10"]
     out.mkdir(parents=True, exist_ok=True)
+    jobs = [(name, seed) for name in names for seed in seeds]
+    if workers is not None:
+        items = [(i / len(jobs), job) for i, job in enumerate(jobs)]
+        blocks = workers.run(_fits, peer, out.resolve(), items)
+        outcomes = [outcome for _, of_block in blocks for outcome in of_block]
+        write_summary(out, outcomes)
+        return outcomes
     outcomes = []
-    for name in names:
-        for seed in seeds:
-            ours = _outcome(name, seed, "ours", out, None, progress)
-            outcomes.append(ours)
-            if peer:
-                outcomes.append(_outcome(name, seed, PEER, out, ours.seconds, progress))
-            write_summary(out, outcomes)
+    for job in jobs:
+        outcomes += _outcomes(peer, out, *job, progress)
+        write_summary(out, outcomes)
     return outcomes
+
+
+def _fits(peer: bool, out: Path, jobs: Sequence[tuple[str, int]]) -> list[Outcome]:
+    return [outcome for job in jobs for outcome in _outcomes(peer, out, *job)]
+
+
+def _outcomes(peer: bool, out: Path, name: str, seed: int, progress: bool = False) -> list[Outcome]:
+    """Our fit of one seed, and that of the peer."""
+    ours = _outcome(name, seed, "ours", out, None, progress)
+    return [ours, _outcome(name, seed, PEER, out, ours.seconds, progress)] if peer else [ours]
 
 
 def _outcome(name: str, seed: int, method: str, out: Path, seconds: float | None, progress: bool) -> Outcome:

@@ -18,7 +18,9 @@ from rimlight.loading import one_line
 from . import free_parameters, losses
 from .free_parameters import to_numpy
 from .problem import Problem
-from .renderer import MAX_SAMPLES, Task, View, derived_seed
+from .renderer import Renderer, Task
+from .view import MAX_SAMPLES, View, derived_seed
+from .workers import Lost
 
 if TYPE_CHECKING:
     from .fitting import Fit
@@ -106,37 +108,64 @@ def of(fit: Fit) -> Result:
         if now.found and min(loss for loss, _ in now.found) < fit.recent()[0]:
             fit.restart_at_best_start()
     latents = fit.latents()
-    start, values, truth = (fit.values(at) for at in (fit.start, latents, _truth(fit)))
-    render, views, measures, floors = fit.renderer.image, [], [], []
-    for i, view in enumerate(fit.renderer.views):
-        task = Task(i, None, _spp(view), derived_seed(seed, 2**31, i))
-        before, after = (render(at, task) for at in (start, values))
-        target, weight = view.picture()
-        views.append(ViewOfFit(before, after, target, weight))
-        compared = [_measures(view, image) for image in (before, after)]
-        measures.append({label: (compared[0][label], compared[1][label]) for label in compared[0]})
-        if fit.truth_is_known:
-            floors.append(losses.root_mean_square(render(truth, task) - target, weight))
+    states = {"start": fit.start, "result": latents} | ({"truth": _truth(fit)} if fit.truth_is_known else {})
+    states = {name: fit.values(at) for name, at in states.items()}
+    seeds = [derived_seed(seed, 2**31, i) for i in range(len(fit.renderer.views))]
+    found = fit.executor.map(evaluate, states, [(i, seed) for i, seed in enumerate(seeds)])
+    views, measures, floors = (list(of_views) for of_views in zip(*found, strict=True))
     first = fit.renderer.views[0]
     small = Task(0, min(first.size[1], SMALL), SMALL_SPP, derived_seed(seed, 2**31 + 1))
-    frames = [(step, render(fit.values(at), small)) for step, at in [*now.frames, (now.step, latents)]]
+    shown = [(step, fit.values(at)) for step, at in [*now.frames, (now.step, latents)]]
+    images = fit.executor.map(_image, small, [(0, values) for _, values in shown])
     on = Task(0, None, min(_spp(first), DERIVATIVE_SPP), derived_seed(seed, 2**31 + 2))
     derivative = None
     try:
-        derivative = fit.renderer.derivative(values, _way(fit, latents), on)
+        (derivative,) = fit.executor.map(_derivative, on, [(0, states["result"], _way(fit, latents))])
     except RuntimeError as error:  # of an integrator that cannot; what was found is not lost by that
+        if isinstance(error, Lost):
+            raise
         log.warning("there is no derivative image: %s", one_line(error))
-    render(values, Task(0, None, 1, 0))  # leave the scene at the result
+    fit.renderer.image(states["result"], Task(0, None, 1, 0))  # leave the scene at the result
     return _result(
         fit,
         latents,
-        values=values,
+        values=states["result"],
         views=views,
         measures=measures,
-        floors=floors,
+        floors=[floor for floor in floors if floor is not None],
         derivative=derivative,
-        frames=frames,
+        frames=[(step, image) for (step, _), image in zip(shown, images, strict=True)],
     )
+
+
+# ------------------------------------------------------------------ what executors call
+
+
+def evaluate(
+    renderer: Renderer, states: Mapping[str, Mapping[str, np.ndarray]], number: int, seed: int
+) -> tuple[ViewOfFit, dict[str, tuple[float, float]], float | None]:
+    """Pictures of a view, its measures before and after, and the noise of a picture at the truth, where it is known.
+
+    states : "start" and "result", and "truth" where it is known: values of scene parameters.
+    """
+    view = renderer.views[number]
+    task = Task(number, None, _spp(view), seed)
+    target, weight = view.picture()
+    pictures = {name: renderer.image(values, task) for name, values in states.items()}
+    before, after = (_measures(view, pictures[name]) for name in ("start", "result"))
+    floor = losses.root_mean_square(pictures["truth"] - target, weight) if "truth" in pictures else None
+    shown = ViewOfFit(pictures["start"], pictures["result"], target, weight)
+    return shown, {label: (before[label], after[label]) for label in before}, floor
+
+
+def _image(renderer: Renderer, task: Task, number: int, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    return renderer.image(values, task)
+
+
+def _derivative(
+    renderer: Renderer, task: Task, number: int, values: Mapping[str, np.ndarray], way: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    return renderer.derivative(values, way, task)
 
 
 def so_far(fit: Fit) -> Result:

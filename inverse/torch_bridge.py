@@ -13,7 +13,8 @@ from rimlight.loading import InputError
 
 from .losses import LossFunction, value_and_metrics
 from .problem import Free, Problem, Stage, Target
-from .renderer import Renderer, Task, alone, derived_seed
+from .renderer import Renderer, Task, alone
+from .view import derived_seed
 
 #: Scenes whose kernels `torch_render` remembers.
 REMEMBERED = 4

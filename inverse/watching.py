@@ -28,21 +28,24 @@ class Watch:
     def __init__(self, fit: Fit, *, title: str, port: int = 0):
         self.fit, self.title = fit, title
         self._page, self._due, self._over = "", 0.0, False
+        self._drawn: Any = None
         self._seen = threading.Event()
         self._server = ThreadingHTTPServer(("127.0.0.1", port), self._handler())
         self._server.daemon_threads = True
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
         fit.on_step(self)
+        fit.shows = lambda: time.monotonic() >= self._due
 
     def __call__(self, step: Step) -> None:
         """Draw the page anew, unless that was done just now, or would take more than its share of the time."""
         began = time.monotonic()
-        if began >= self._due:
+        if self.fit.image is not self._drawn:
             self._draw()
             ended = time.monotonic()
             self._due = ended + max(PAUSE, (ended - began) / SHARE)
 
     def _draw(self) -> None:
+        self._drawn = self.fit.image
         self._page = report.live(result.so_far(self.fit), title=self.title)
 
     def __enter__(self) -> Watch:
@@ -52,7 +55,7 @@ class Watch:
     def __exit__(self, *_: Any) -> None:
         """The last page stays in the browser: wait until it has asked for it, if one is open."""
         opened, self._over = self._seen.is_set(), True
-        if self.fit.progress.step:
+        if self.fit.image is not None:
             self._draw()
         self._seen.clear()
         if opened:

@@ -123,7 +123,7 @@ def test_command_lines_parse(line):
 
     from rimlight.cli._commands import commands as known
 
-    arguments = [str(ROOT / "scenes/fits/fig6a.toml") if a == "fit.toml" else a for a in shlex.split(line)[1:]]
+    arguments = [str(ROOT / "scenes/fits/fig6a.toml") if a.endswith(".toml") else a for a in shlex.split(line)[1:]]
     command = tyro.extras.subcommand_cli_from_dict(known(arguments), args=arguments)
     scene = getattr(command, "scene", None)
     assert scene is None or (ROOT / scene).is_file()

@@ -36,9 +36,9 @@ class Fit:
     resume: bool = False
     """Continue from the checkpoint in that folder."""
     workers: int = 0
-    """Number of processes that share the work. 0: this process does all of it."""
+    """Number of processes of this machine that share the work. 0: this process does all of it."""
     cluster: str | None = None
-    """Address of the scheduler of a Dask cluster, or "local"."""
+    """Address of the scheduler of a Dask cluster, such as tcp://10.0.0.1:8786, whose workers share the work."""
     watch: bool = False
     """Show the report while the fit runs, on a page that only this machine can open. Its address is printed."""
     tensorboard: bool = False
@@ -57,13 +57,11 @@ class Fit:
                 kinds = ", ".join(sorted({f.kind for f in problem.free}))
                 raise InputError(f'nothing of the kind "{self.kind}" is free in "{self.config}", only {kinds}')
             problem = dataclasses.replace(problem, free=free)
-        logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
+        _show_warnings()
         with ExitStack() as stack, expected(OSError):
             executor = None
-            if self.cluster is not None:
-                executor = stack.enter_context(inverse.Cluster(problem, self.cluster))
-            elif self.workers:
-                executor = stack.enter_context(inverse.Processes(problem, self.workers))
+            if self.cluster is not None or self.workers:
+                executor = stack.enter_context(inverse.Cluster(problem, self.cluster or self.workers))
             fit = inverse.Fit(
                 problem, out=self.out, resume=self.resume, executor=executor, tensorboard=self.tensorboard
             )
@@ -75,6 +73,13 @@ class Fit:
             inverse.write(self.out, found, title=self.config.stem)
         print(f"report: {self.out / 'report.html'}")
         return {"finished": 0, "out of time": 0, "interrupted": 130}.get(found.status, 1)
+
+
+def _show_warnings() -> None:
+    """Of Rimlight; what Dask says of its workers' lives and deaths is said again in a line of ours."""
+    handler = logging.StreamHandler()
+    handler.addFilter(lambda record: not record.name.startswith("distributed"))
+    logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s", handlers=[handler])
 
 
 def _print(found: inverse.Result) -> None:
@@ -129,14 +134,24 @@ class Reproduce:
     """Number of random seeds. Each fit runs once for each seed."""
     peer: bool = False
     """Run each fit also with Mitsuba's prb_projective, for as long as Rimlight's took."""
+    workers: int = 0
+    """Number of processes of this machine, each of which runs one fit at a time. 0: this process runs all of them."""
+    cluster: str | None = None
+    """Address of the scheduler of a Dask cluster, such as tcp://10.0.0.1:8786, whose workers run the fits."""
 
     def run(self) -> int:
         from rimlight.inverse import reproduce
 
         at_least(1, seeds=self.seeds)
+        at_least(0, workers=self.workers)
         check_output(self.out, folder=True)
-        logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
-        with expected(OSError):
-            outcomes = reproduce.reproduce(self.figure, self.out, seeds=range(self.seeds), peer=self.peer)
+        _show_warnings()
+        with ExitStack() as stack, expected(OSError):
+            workers = None
+            if self.cluster is not None or self.workers:
+                workers = stack.enter_context(inverse.Workers(self.cluster or self.workers))
+            outcomes = reproduce.reproduce(
+                self.figure, self.out, seeds=range(self.seeds), peer=self.peer, workers=workers
+            )
         print("\n".join(reproduce.table(outcomes)))
         return 0

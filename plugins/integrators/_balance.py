@@ -18,11 +18,16 @@ LEAST = 1 / 8
 class Balance:
     """What `EdgeIntegrator.balance` has measured, by the names of the terms.
 
-    noise : mean absolute deviation of one derivative from its mean, summed over the film, relative to the sum of the
+    Attributes
+    ----------
+    noise
+        Mean absolute deviation of one derivative from its mean, summed over the film, relative to the sum of the
         absolute values of that mean; with the same number of samples per pixel in each term.
-    cost : about how long a sample per pixel takes, relative to all terms together.
-    shares : by what the samples of each term are multiplied from now on. All together cost as much as before, or less
-        where limits leave nothing else.
+    cost
+        About how long a sample per pixel takes, relative to all terms together.
+    shares
+        By what the samples of each term are multiplied from now on. All together cost as much as before, or less where
+        limits leave nothing else.
     """
 
     noise: dict[str, float]

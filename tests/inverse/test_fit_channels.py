@@ -50,7 +50,7 @@ def test_the_gradient_is_that_of_the_channel_alone():
         for aovs in (AOVS, alone):
             renderer = Renderer(cube(channel, aovs))
             values = {k: np.array(renderer.params[k], np.float32) + np.float32(0.05) for k in POSE.key}
-            found = renderer.gradient(values, Task(0, None, 16, 3))
+            found = renderer.gradient(values, [Task(0, None, 16, 3, show=True)])
             gradients.append(found.gradients[POSE.key[0]])
             losses.append(found.loss)
         size = np.abs(gradients[1]).sum()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from rimlight.inverse import result as results
 from rimlight.inverse.fitting import Fit
 from rimlight.inverse.optimisers import inner_product
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
-from rimlight.inverse.renderer import Renderer, Task
+from rimlight.inverse.renderer import Gradient, Renderer, Task
 
 ROOM = """<scene version="3.0.0">
     <default name="width" value="24"/>
@@ -105,7 +106,7 @@ def test_gradient_is_that_of_the_loss(room, view, key, kind, start, latent, dire
         dr.enable_grad(latents[latent])
         attached = parameter.values(latents)
         at = {key: free_parameters.to_numpy(value) for key, value in attached.items()}
-        found = tested.gradient(at, Task(view, None, 64, seed)).gradients
+        found = tested.gradient(at, [Task(view, None, 64, seed)]).gradients
         dr.backward(sum(inner_product(value, found[key]) for key, value in attached.items()))
         return float(np.dot(dr.grad(latents[latent]).numpy(), direction))
 
@@ -160,7 +161,7 @@ def test_gradient_is_not_biased_by_shared_samples(room, monkeypatch, shared):
     expected = 2 * np.sum((dark + ρ * per_ρ - target) * per_ρ, axis=(0, 1)) / target.size
     if shared:
         monkeypatch.setattr(renderer, "derived_seed", lambda *numbers: numbers[0])
-    gradients = [tested.gradient({FLOOR: ρ}, Task(0, 8, 1, seed)).gradients[FLOOR] for seed in range(300)]
+    gradients = [tested.gradient({FLOOR: ρ}, [Task(0, 8, 1, seed)]).gradients[FLOOR] for seed in range(300)]
     error = np.std(gradients, axis=0, ddof=1) / np.sqrt(len(gradients))
     z = (np.mean(gradients, axis=0) - expected) / error
     assert (error < 0.02 * np.abs(expected)).all(), "too noisy to mean something"
@@ -177,7 +178,7 @@ def test_seeds_differ():
 def test_parts_of_a_step_are_independent_and_can_be_repeated(room):
     tested = Renderer(problem(room))
     at = {FLOOR: np.float32([0.3, 0.4, 0.5])}
-    first, other, again = (tested.gradient(at, Task(0, None, 2, seed)) for seed in (1, 2, 1))
+    first, other, again = (tested.gradient(at, [Task(0, None, 2, seed, show=True)]) for seed in (1, 2, 1))
     np.testing.assert_allclose(again.gradients[FLOOR], first.gradients[FLOOR], rtol=1e-5)
     np.testing.assert_allclose(again.image, first.image, rtol=1e-4, atol=1e-6)
     assert np.abs(first.image - other.image).max() > 0.01 and first.loss != other.loss
@@ -189,9 +190,9 @@ def test_what_came_before_does_not_matter(room):
     at = lambda x: {FLOOR: np.float32([0.3, 0.4, x]), BOX: box + np.float32(x)}
     first, second = Renderer(problem(room)), Renderer(problem(room))
     first.image(at(0.4), Task(1, 8, 4, 0))
-    first.gradient(at(-0.3), Task(1, 8, 4, 0))
-    first.gradient(at(0.3), Task(0, None, 4, 0))
-    found, expected = (tested.gradient(at(0.1), Task(0, None, 4, 1)) for tested in (first, second))
+    first.gradient(at(-0.3), [Task(1, 8, 4, 0)])
+    first.gradient(at(0.3), [Task(0, None, 4, 0)])
+    found, expected = (tested.gradient(at(0.1), [Task(0, None, 4, 1, show=True)]) for tested in (first, second))
     np.testing.assert_allclose(first.views[0].picture()[0], second.views[0].picture()[0], rtol=1e-5)
     assert found.loss == pytest.approx(expected.loss, rel=1e-5)
     for key, gradient in expected.gradients.items():
@@ -215,7 +216,7 @@ def test_replayed_gradients_are_the_same(room, kind):
         for i in range(6):
             at = {FLOOR: np.float32([0.3, 0.4, 0.1 * i]), BOX: box + np.float32(0.02 * i)}
             at["right.to_world"] = camera + np.outer([0.05 * i, 0, 0, 0], [0, 0, 0, 1])
-            gradients.append(tested.gradient(at, Task(i % 2, (None, 12)[i % 2], 4, i)))
+            gradients.append(tested.gradient(at, [Task(i % 2, (None, 12)[i % 2], 4, i, show=True)]))
         found.append(gradients)
         functions = [f for view in tested.views for pair in view.functions.values() for f in pair]
         assert len(functions) == 4 and {hasattr(f, "n_recordings") for f in functions} == {freeze}
@@ -231,23 +232,65 @@ def test_replayed_gradients_are_the_same(room, kind):
     assert all(gradients[5].gradients[key].any() for gradients in found for key in keys)
 
 
+def test_gradients_of_several_tasks_are_their_sum(room):
+    """The parameters are set once for all; two of the views are of one scene."""
+    tested = Renderer(problem(room))
+    at = {
+        FLOOR: np.float32([0.3, 0.4, 0.5]),
+        BOX: np.array(tested.params[BOX], np.float32) + np.float32(0.02),
+        "right.to_world": free_parameters.to_numpy(tested.params["right.to_world"]),
+    }
+    tasks = [Task(i % 2, (None, 12)[i // 2], 4, i, stage=0, doubt=i == 0, show=i == 1) for i in range(4)]
+    for _ in range(2):  # recorded, and replayed
+        apart, together = [tested.gradient(at, [task]) for task in tasks], tested.gradient(at, tasks)
+        assert together.loss == pytest.approx(sum(g.loss for g in apart), rel=1e-6)
+        np.testing.assert_allclose(together.image, apart[1].image, rtol=1e-4, atol=1e-6)
+        for key in at:
+            total = sum(g.gradients[key] for g in apart)
+            np.testing.assert_allclose(together.gradients[key], total, rtol=0, atol=2e-6 * np.abs(total).max())
+
+
+def test_memory_has_a_limit(room):
+    """Samples are rendered in passes; the derivatives are as good."""
+    posed = problem(room, integrator={"type": "prb_edge", "max_depth": 3}, target=Target(spp=16))
+    at = {FLOOR: np.float32([0.3, 0.4, 0.5])}
+
+    def peak(limit: float | None, spp: int) -> tuple[float, Gradient, int]:
+        tested = Renderer(dataclasses.replace(posed, max_memory=limit))
+        tested.gradient(at, [Task(0, None, 1, 0)])
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        found = tested.gradient(at, [Task(0, None, spp, 7)])
+        return dr.detail.malloc_watermark(dr.JitBackend.LLVM) / 1e6, found, tested.views[0]._passes(spp)
+
+    most, whole, _ = peak(None, 64)
+    little, parts, passes = peak(most / 3, 64)
+    assert little <= most / 3 and 3 < passes < 64
+    assert parts.loss == pytest.approx(whole.loss, rel=0.1)
+    expected = whole.gradients[FLOOR]
+    np.testing.assert_allclose(parts.gradients[FLOOR], expected, rtol=0, atol=0.02 * np.abs(expected).max())
+    with pytest.raises(ValueError, match=r"max_memory is 0\.01 MB, but one sample per pixel of target 0 at \d+ x \d+"):
+        peak(0.01, 4)
+
+
 def test_scenes_are_not_freed_while_a_function_is_recorded(room, monkeypatch):
     """Dr.Jit would end the process."""
     seen = []
-    plain = Renderer(problem(room, freeze=False)).views[0]
+    renderer = Renderer(problem(room, freeze=False))
+    plain = renderer.views[0]
     functions = plain._functions(1)
     spies = [lambda *a, f=f: (seen.append(gc.isenabled()), f(*a))[1] for f in functions]
     monkeypatch.setattr(plain, "_functions", lambda spp: spies)
-    plain.renderer.gradient({FLOOR: np.float32([0.3, 0.4, 0.5])}, Task(0, None, 1, 0))
+    renderer.gradient({FLOOR: np.float32([0.3, 0.4, 0.5])}, [Task(0, None, 1, 0)])
     assert seen == [False, False] and gc.isenabled()
 
 
 def test_size_of_the_film_changes_and_comes_back(room):
     tested = Renderer(problem(room))
     at = {FLOOR: np.float32([0.3, 0.4, 0.5]), BOX: np.array(tested.params[BOX], np.float32)}
-    full = tested.gradient(at, Task(1, None, 16, 0))
-    small = tested.gradient(at, Task(1, 6, 16, 0))
-    again = tested.gradient(at, Task(1, None, 16, 0))
+    full = tested.gradient(at, [Task(1, None, 16, 0, show=True)])
+    small = tested.gradient(at, [Task(1, 6, 16, 0, show=True)])
+    again = tested.gradient(at, [Task(1, None, 16, 0, show=True)])
     assert full.image.shape == (16, 24, 3) and small.image.shape == (4, 6, 3)
     np.testing.assert_allclose(small.image.mean(), full.image.mean(), rtol=0.1)
     np.testing.assert_allclose(again.loss, full.loss, rtol=1e-5)
@@ -269,7 +312,7 @@ def test_views_of_scenes_of_their_own(room, tmp_path):
     tested = Renderer(problem(room, target=two))
     at = {FLOOR: np.float32([0.8, 0.6, 0.5]), BOX: np.array(tested.params[BOX], np.float32)}
     np.testing.assert_allclose(tested.params[FLOOR].numpy().ravel(), [0.8, 0.6, 0.5])  # of the first scene
-    first, second = (tested.gradient(at, Task(i, None, 16, 0)) for i in range(2))
+    first, second = (tested.gradient(at, [Task(i, None, 16, 0, show=True)]) for i in range(2))
     assert first.gradients.keys() == {FLOOR, BOX} and second.gradients.keys() == {FLOOR}
     assert first.image.shape == (24, 24, 3) and second.image.shape == (16, 24, 3)
     assert second.loss > 20 * first.loss > 0
@@ -286,7 +329,7 @@ def test_films_and_pictures_of_other_channels(room, tmp_path, pixels, channels):
     Image.fromarray(np.uint8(255 * grey).squeeze()).save(file)
     posed = problem(room, define={"format": pixels}, target=(Target(file=file),), loss=Loss(pyramid=1))
     tested = Renderer(posed)
-    found = tested.gradient({FLOOR: np.float32([0.3, 0.4, 0.5])}, Task(0, None, 4, 0))
+    found = tested.gradient({FLOOR: np.float32([0.3, 0.4, 0.5])}, [Task(0, None, 4, 0, show=True)])
     assert found.image.shape == (24, 24, 1 if pixels.startswith("luminance") else 3)
     assert tested.views[0]._truth().shape == found.image.shape
     target = np.full_like(found.image, ((0.5 + 0.055) / 1.055) ** 2.4)
@@ -300,7 +343,7 @@ def test_a_film_without_colours_does_not_show_them(room, tmp_path):
     Image.fromarray(np.full((24, 24, 3), 128, np.uint8)).save(file)
     tested = Renderer(problem(room, define={"format": "luminance"}, target=(Target(file=file),)))
     with pytest.raises(ValueError, match=r"target\.0: the picture has 3 channels, the film 1"):
-        tested.gradient({}, Task(0, None, 1, 0))
+        tested.gradient({}, [Task(0, None, 1, 0, show=True)])
 
 
 def test_a_resolution_at_which_no_pixel_counts_is_refused_at_once(room, tmp_path):

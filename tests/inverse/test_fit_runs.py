@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 import errno
 import json
-import logging
 import os
 import re
 import signal
 import subprocess
 import sys
-import threading
 import types
 import zipfile
 from pathlib import Path
@@ -24,7 +22,7 @@ from rimlight.cli import main
 from rimlight.inverse import checkpoint, executors, fitting, progress, report
 from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Starts, Target
-from rimlight.inverse.renderer import Gradient, Renderer, Task
+from rimlight.inverse.renderer import Gradient, Renderer
 from rimlight.inverse.result import Result
 
 GREEN, RED, COLOUR = "green.vertex_positions", "red.vertex_positions", "green.bsdf.reflectance.value"
@@ -46,14 +44,14 @@ def stopping_after(steps: int):
     """An executor in the middle of whose work somebody presses Ctrl-C."""
     calls = []
 
-    def executor(values, tasks):
-        calls.append(1)
-        if len(calls) == steps:
-            os.kill(os.getpid(), signal.SIGINT)
-        return [executor.renderer.gradient(values, task) for task in tasks]
+    class Pressed(executors.Here):
+        def gradient(self, values, tasks):
+            calls.append(1)
+            if len(calls) == steps:
+                os.kill(os.getpid(), signal.SIGINT)
+            return super().gradient(values, tasks)
 
-    executor.renderer = Renderer(triangles())
-    return executor
+    return Pressed(Renderer(triangles()))
 
 
 # ------------------------------------------------------------------ checkpoints
@@ -67,7 +65,7 @@ from rimlight import inverse
 import drjit as dr
 import numpy as np
 from rimlight import exr
-from rimlight.inverse import checkpoint, fitting, problem, progress
+from rimlight.inverse import checkpoint, executors, fitting, problem, progress
 
 dr.set_thread_count(1)
 fitting.INTERVAL, progress.SHARE = 0, float("inf")  # a checkpoint after each step
@@ -76,17 +74,18 @@ folder, start, end, last = sys.argv[1:]
 run = fitting.Fit(problem.read("fit.toml"), out=folder, resume=start == "resume")
 print(run.progress.step, flush=True)
 
-def executor(values, tasks):
-    if run.progress.step == int(last):
-        if end == "between":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if end == "writing":
-            exr.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-    if end == "between" and run.progress.step == int(last) - 3:
-        fitting.INTERVAL = 1000
-    return [run.renderer.gradient(values, task) for task in tasks]
+class Killing(executors.Here):
+    def gradient(self, values, tasks):
+        if run.progress.step == int(last):
+            if end == "between":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if end == "writing":
+                exr.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+        if end == "between" and run.progress.step == int(last) - 3:
+            fitting.INTERVAL = 1000
+        return super().gradient(values, tasks)
 
-run.executor = executor
+run.executor = Killing(run.renderer)
 found = run.run(progress=False)
 errors = {label.replace("/", " "): e for label, e in found.errors.items()}
 np.savez(folder + ".npz", losses=found.losses, segments=found.segments, **found.values, **errors)
@@ -239,15 +238,16 @@ def test_checkpoints_take_a_twentieth_of_the_time(tmp_path, monkeypatch):
     monkeypatch.setattr(fitting, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
     run = fitting.Fit(triangles(MATERIAL, steps=100), out=tmp_path)
 
-    def executor(values, tasks):
-        now[0] += 1
-        return [Gradient(1.0, {COLOUR: np.zeros(3, np.float32)}, np.zeros((16, 16, 3), np.float32)) for _ in tasks]
+    class Idle(executors.Here):
+        def gradient(self, values, tasks):
+            now[0] += 1
+            return Gradient({COLOUR: np.zeros(3, np.float32)}, {t.key: 1.0 for t in tasks}, {t.key: {} for t in tasks})
 
     def save(file):
         now[0] += 2
         written.append(run.progress.step)
 
-    run.executor, run.save = executor, save
+    run.executor, run.save = Idle(run.renderer), save
     assert len(list(run)) == 100
     assert written[0] == 6 and written[1] - written[0] == 41  # the first one tells what they cost
     assert written[-1] == 100 and 2 * (len(written) - 1) <= 0.05 * 100 + 2
@@ -265,72 +265,6 @@ def test_a_report_is_written_with_what_fits(tmp_path, monkeypatch):
         inverse.write(tmp_path, found, title="Full")
     names = {path.name for path in tmp_path.iterdir()}
     assert names >= {"report.html", "result.json", "result.npz", "problem.toml", "result_0.png", "target_0.png"}
-
-
-# ------------------------------------------------------------------ other processes
-
-
-def shared() -> Problem:
-    """Two views, in two parts each."""
-    targets = Target(spp=64), Target(scene=scenes.path("two_triangles"), spp=32)
-    return triangles(SHAPE, MATERIAL, steps=4, target=targets, parts=2)
-
-
-@pytest.fixture(scope="module")
-def alone() -> Result:
-    return fit(shared())
-
-
-def assert_same(found: Result, alone: Result) -> None:
-    assert found.status == "finished"
-    np.testing.assert_allclose(found.losses, alone.losses, rtol=1e-6 / alone.losses.max())
-    for key, value in alone.values.items():
-        np.testing.assert_allclose(found.values[key], value, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 2])
-def test_processes_find_the_same(alone, caplog, count):
-    """Also when one of them is killed at its work."""
-    posed = shared()
-    with inverse.Processes(posed, count) as workers:
-        assert_same(fit(posed, executor=workers), alone)
-        if count == 2:
-            first = workers.pool
-            values = {GREEN: alone.values[GREEN], COLOUR: alone.values[COLOUR]}
-            tasks = [Task(i % 2, 160, 64, i) for i in range(6)]
-            timer = threading.Timer(0.1, os.kill, (next(iter(first._processes)), signal.SIGKILL))
-            timer.start()
-            with caplog.at_level(logging.WARNING, logger=executors.__name__):
-                found = workers(values, tasks)
-            timer.join()
-            assert workers.pool is not first and "a worker died (1 of 4 tries)" in caplog.text
-            assert len({gradient.loss for gradient in found}) == 6
-            expected = Renderer(posed).gradient(values, tasks[5])
-            assert found[5].loss == pytest.approx(expected.loss, rel=1e-5)
-            assert_same(fit(posed, executor=workers), alone)
-    assert not workers.pool._processes
-
-
-def test_there_must_be_a_worker():
-    with pytest.raises(ValueError, match="workers must be >= 1, got 0"):
-        inverse.Processes(shared(), 0)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("default::ResourceWarning", "default::DeprecationWarning")
-def test_a_cluster_finds_the_same(alone):
-    pytest.importorskip("distributed")
-    posed = shared()
-    with inverse.Cluster(posed, "local") as workers:
-        assert_same(fit(posed, executor=workers), alone)
-
-
-def test_there_must_be_a_cluster():
-    pytest.importorskip("distributed")
-    with pytest.raises(ValueError, match='no cluster at "nonsense://1"') as error:
-        inverse.Cluster(shared(), "nonsense://1")
-    assert "\n" not in str(error.value)
 
 
 # ------------------------------------------------------------------ command line
@@ -384,7 +318,7 @@ def test_kinds_and_options_of_the_command(file, tmp_path, capfd):
 
 def test_exit_codes_of_fits_that_stop(file, tmp_path, capfd, monkeypatch):
     gradient = Renderer.gradient
-    broken = lambda *a: dataclasses.replace(gradient(*a), loss=float("nan"))
+    broken = lambda *a: dataclasses.replace(gradient(*a), losses=dict.fromkeys((t.key for t in a[-1]), float("nan")))
 
     def pressed(*a):
         os.kill(os.getpid(), signal.SIGINT)

@@ -16,8 +16,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight import inverse, scenes
-from rimlight.inverse import fitting, result
+from rimlight import scenes
+from rimlight.inverse import batches, executors, fitting, result
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
 from rimlight.inverse.renderer import Gradient
 from rimlight.inverse.result import Result
@@ -35,24 +35,30 @@ def triangles(*free: Free, steps: int = 12, **options) -> Problem:
     return Problem(scene=scenes.path("two_triangles"), free=free or (SHAPE,), **options)
 
 
-def fit(problem: Problem, **options) -> Result:
-    return inverse.fit(problem, progress=False, **options)
+def fit(problem: Problem, executor: Valley | None = None, **options) -> Result:
+    run = fitting.Fit(problem, **options)
+    if executor is not None:
+        executor.here, run.executor = run.executor, executor
+    return run.run(progress=False)
 
 
 class Valley:
-    """An executor that renders nothing: a function of the colour of the green triangle and its derivative, and what
-    happens at some steps."""
+    """An executor that renders nothing in steps: a function of the colour of the green triangle and its derivative, and
+    what happens at some steps."""
 
     def __init__(self, at: dict | None = None, slope=lambda c: (np.sum((c - 0.6) ** 2), 2 * (c - 0.6))):
         self.at, self.slope, self.calls, self.seen = at or {}, slope, 0, []
 
-    def __call__(self, values, tasks):
+    def gradient(self, values, tasks):
         self.calls += 1
         self.seen.append(values[COLOUR].copy())
         happens = self.at.get(self.calls, lambda loss, gradient: (loss, gradient))
         loss, gradient = happens(*self.slope(values[COLOUR]))
-        image = np.zeros((1, 1, 3), np.float32)
-        return [Gradient(float(loss), {COLOUR: np.float32(gradient)}, image) for _ in tasks]
+        of_tasks = lambda value: {task.key: value for task in tasks}
+        return Gradient({COLOUR: np.float32(gradient)}, of_tasks(float(loss)), of_tasks({}))
+
+    def map(self, function, shared, calls):
+        return self.here.map(function, shared, calls)
 
 
 def error_of(found: Result, label: str) -> np.ndarray:
@@ -90,11 +96,12 @@ def test_stages_have_resolutions_and_rates():
     )
     run = fitting.Fit(posed)
 
-    def executor(values, tasks):
-        seen.append((tasks[0].width, tasks[0].spp, tasks[0].seed, values[GREEN].copy()))
-        return [run.renderer.gradient(values, task) for task in tasks]
+    class Seen(executors.Here):
+        def gradient(self, values, tasks):
+            seen.append((tasks[0].width, tasks[0].spp, tasks[0].seed, values[GREEN].copy()))
+            return super().gradient(values, tasks)
 
-    run.executor = executor
+    run.executor = Seen(run.renderer)
     found = run.run(progress=False)
     assert [s[:2] for s in seen] == 5 * [(8, 4)] + 4 * [(None, 2)]
     assert len({s[2] for s in seen}) == 9
@@ -103,6 +110,21 @@ def test_stages_have_resolutions_and_rates():
     assert max(moved[5:]) < 0.5 * 0.05 * 1.5 and moved[7] < 0.2 * moved[5]
     np.testing.assert_array_equal(found.segments, 5 * [0] + 4 * [1])
     assert found.views[0].result.shape == (32, 32, 3)
+
+
+def test_steps_of_a_few_views():
+    """Drawn at random, one of each group of neighbours; the same when they are drawn again."""
+    posed = triangles(MATERIAL, target=tuple(Target(spp=4) for _ in range(10)), views_per_step=4, steps=3)
+    drawn = np.array([batches.views(posed, step) for step in range(4000)])
+    assert (np.diff(drawn, axis=1) >= 0).all()
+    shares = np.bincount(drawn.ravel(), minlength=10) / drawn.size
+    np.testing.assert_allclose(shares, 0.1, atol=0.005)  # of 16,000 draws, 0.0024 is one standard error
+    assert batches.views(posed, 7) == batches.views(posed, 7) and len({tuple(row) for row in drawn}) > 50
+    found = fit(posed)
+    assert found.status == "finished" and len(found.views) == 10
+    np.testing.assert_array_equal(fit(posed).losses.round(6), found.losses.round(6))
+    with pytest.raises(ValueError, match="views_per_step is 11, but there are only 10 targets"):
+        dataclasses.replace(posed, views_per_step=11)
 
 
 def test_the_scene_is_left_at_the_result():
@@ -173,7 +195,7 @@ def test_noise_of_the_loss_does_not_choose_the_result():
 
 def test_log_for_tensorboard(tmp_path):
     pytest.importorskip("tensorboardX")
-    inverse.fit(triangles(MATERIAL, steps=3), executor=Valley(), out=tmp_path, tensorboard=True, progress=False)
+    fit(triangles(MATERIAL, steps=3), executor=Valley(), out=tmp_path, tensorboard=True)
     (file,) = tmp_path.glob("events.out.tfevents.*")
     assert b"loss" in file.read_bytes()
     with pytest.raises(ValueError, match="name a folder"):

@@ -104,7 +104,7 @@ def test_a_fit_in_memory_is_resumed_if_its_arrays_are_the_same(tmp_path):
     with pytest.raises(ValueError, match=r"problem\.toml: fit: .*memory of a Python program"):
         problems.read(tmp_path / "problem.toml")
     with pytest.raises(ValueError, match="memory of a Python program"):
-        inverse.Processes(mine(image), 2)
+        inverse.Cluster(mine(image), 2)
 
 
 # ------------------------------------------------------------------ losses
@@ -172,7 +172,7 @@ def test_stages_have_norms():
     fit = inverse.Fit(posed(loss=Loss(norm="relative"), stage=stages))
     values = fit.values()
     seen = [step.loss for step in fit]
-    first = fit.renderer.gradient(values, fit_task(fit, 0, 0))
+    first = fit.renderer.gradient(values, [fit_task(fit, 0, 0)])
     image, (target, weight) = first.image, fit.renderer.views[0].target_at((16, 16))
     for stage, norm in enumerate((losses.L1(), losses.L2(), losses.Relative())):
         assert fit.renderer.losses[stage](image, target, weight)[0] == pytest.approx(norm(image, target, weight)[0])
@@ -184,7 +184,7 @@ def test_stages_have_norms():
 def fit_task(fit: inverse.Fit, step: int, stage: int):
     from rimlight.inverse.renderer import Task, derived_seed
 
-    return Task(0, None, 4, derived_seed(fit.problem.seed, step, 0, 0), stage)
+    return Task(0, None, 4, derived_seed(fit.problem.seed, step, 0, 0), stage, show=True)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from rimlight import scenes
 from rimlight.exr import read_exr
 from rimlight.inverse import animation, fitting, page, problem, report, result
 from rimlight.inverse.problem import Free, Problem, Stage, Starts, Target
-from rimlight.inverse.result import Result
+from rimlight.inverse.result import Result, ViewOfFit
 
 NASTY = '<script>alert("a&b")</script> \'$x^$'
 
@@ -90,6 +90,22 @@ def test_page_says_what_happened(folder, fit):
         assert part in text
     assert "influence" not in text
     assert "farther" not in text
+
+
+@pytest.mark.slow
+def test_many_views_are_small(fit, tmp_path):
+    """A page of 100 views, even of noise, which does not compress: the first and the worst ones in detail."""
+    rng = np.random.default_rng(0)
+    noise = [rng.random((256, 256, 3), np.float32) for _ in range(4)]
+    view = lambda i: ViewOfFit(*(noise[(i + k) % 4] for k in range(3)), np.ones((256, 256), np.float32))
+    measures = [{"root mean square error": (0.5, 0.9 if i in (17, 42, 99) else 0.1)} for i in range(100)]
+    many = dataclasses.replace(fit, views=[view(i) for i in range(100)], measures=measures, floors=[])
+    assert report._in_detail(many) == [0, 17, 42, 99]
+    shown = written(tmp_path / "report.html", many)
+    assert (tmp_path / "report.html").stat().st_size < 20e6
+    assert len(shown.images()) >= 200 and "View 57: 0.50 → 0.10" in shown.text
+    linked = report._views(many, beside=True)
+    assert 'href="result_57.png"' in linked and 'href="result_57.png"' not in report._views(many)
 
 
 def test_names_are_escaped(fit, tmp_path):

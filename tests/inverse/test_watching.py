@@ -33,14 +33,14 @@ def page(url: str, **headers: str) -> tuple[str, str | None]:
 
 
 def test_the_page_follows_the_fit(fit, monkeypatch):
-    monkeypatch.setattr(inverse.watching, "PAUSE", 0.01)
+    monkeypatch.setattr(inverse.watching, "PAUSE", 0.001)
     monkeypatch.setattr(inverse.watching, "SHARE", float("inf"))
     with inverse.Watch(fit, title="Mine & yours") as watch:
         assert watch.url.startswith("http://127.0.0.1:")
         assert "not done yet" in page(watch.url)[0]
         for step in fit:
             text, again = page(watch.url)
-            assert f"{step.number + 1} of 2 steps" in text and "Mine &amp; yours" in text and again == "0.01"
+            assert f"{step.number + 1} of 2 steps" in text and "Mine &amp; yours" in text and again == "0.001"
             assert ">running<" in text and "did not finish" not in text and text.count("data:image/png") >= 3
     with pytest.raises(urllib.error.URLError):
         page(watch.url)
@@ -62,11 +62,14 @@ def test_drawing_takes_a_twentieth_of_the_time(fit, monkeypatch):
     watch = inverse.Watch(fit, title="Mine")
 
     def draw() -> None:
+        watch._drawn = fit.image
         now[0] += 1
         drawn.append(now[0])
 
     watch._draw = draw
     for _ in range(100):
+        if fit.shows():
+            fit.image = object()
         watch(None)
         now[0] += 0.5
     watch._server.server_close()
