@@ -271,7 +271,7 @@ class Generator:
             "bumps": lambda: {
                 "type": "bumpmap",
                 "texture": self.bitmap(5, 7),
-                "scale": 0.1,
+                "scale": 0.1 * self.scale,  # a height
                 "bsdf": {"type": "diffuse", "reflectance": colour},
             },
             "leaf": lambda: {
