@@ -13,11 +13,11 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.sampling import EdgeSample
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
-from rimlight.edge_sampling.geometry.beam_lines import BeamLines
 from rimlight.edge_sampling.geometry.beams import ROUNDING
 from rimlight.edge_sampling.geometry.device_edges import rounding
 from rimlight.edge_sampling.geometry.texture_lines import lines_of_beam
 
+from .beam_lines import BeamLines
 from .indirect_shadows import IndirectShadows
 from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow
 

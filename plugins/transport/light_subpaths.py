@@ -25,7 +25,7 @@ class LightVertex:
 
     o, d, pi : the ray to it, and what that meets.
     β : power that arrives there, over its density and over the cosine under which it does.
-    shorter : how the subpath might have been made otherwise.
+    one, more : how the subpath might have been made otherwise, see `Shorter`.
     number : along the subpath, 1 is the first that the light meets; 0: there is none.
     """
 
@@ -33,8 +33,13 @@ class LightVertex:
     d: mi.Vector3f
     pi: mi.PreliminaryIntersection3f
     β: mi.Spectrum
-    shorter: Shorter
+    one: mi.Float
+    more: mi.Float
     number: mi.UInt32
+
+    @property
+    def shorter(self) -> Shorter:
+        return Shorter(self.one, self.more)
 
     @property
     def ray(self) -> mi.Ray3f:
@@ -139,7 +144,7 @@ class LightSubpaths:
             cosine = dr.abs_dot(si.n, ray.d)
             active &= cosine > 0
             shorter = shorter.at(pi.t, cosine)
-            vertex = LightVertex(ray.o, ray.d, pi, β / cosine, shorter, number)
+            vertex = LightVertex(ray.o, ray.d, pi, β / cosine, shorter.one, shorter.more, number)
             connects = active & smooth(bsdf)
             if views.projects:
                 self._to_sensor(si, bsdf, vertex, sampler, views, splat, connects)

@@ -36,8 +36,11 @@ def gradient(scene, motion, weights, spp=16, seed=3, **options):
 
 # ---------------------- Primal ----------------------
 
+#: Scenes whose light `direct_edge` and `path` hardly find: tests of `bdpt` have them.
+BIDIRECTIONAL = "door_ajar", "glossy_caustic", "lampshade"
 
-@pytest.mark.parametrize("name", rimlight.scenes.names())
+
+@pytest.mark.parametrize("name", [n for n in rimlight.scenes.names() if n not in BIDIRECTIONAL])
 def test_image_agrees_with_the_stored_reference(name, root):
     """z-test against `path` at depth 2: tests/references/images/*.exr, made by make_images.py."""
     layers, _ = read_exr(root / "tests" / "references" / "images" / f"{name}.exr")

@@ -10,10 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.geometry.beams import off_texture
+from rimlight.edge_sampling.geometry.texture_lines import Lattice, lines_of_beam
 from rimlight.edge_sampling.lights import Lights
-
-from .beams import off_texture
-from .texture_lines import Lattice, lines_of_beam
 
 #: Arcs into which the circle is divided around the beam of a spot, so that they are about as long as other lines.
 ARCS = 4
