@@ -676,7 +676,7 @@ def test_frozen(table):
         same = np.isclose(np.array(image), np.array(expected), rtol=1e-4, atol=1e-5)
         assert (~same).any(2).sum() <= 1
         np.testing.assert_allclose(np.array(image), np.array(expected), rtol=0.1)
-        assert gradient[0] == pytest.approx(its_gradient[0], rel=1e-4) and gradient[0] > 0
+        assert gradient[0] == pytest.approx(its_gradient[0], rel=1e-3) and gradient[0] > 0
         images.append(np.array(image))
     assert frozen.n_recordings <= 2  # the first call makes the film's storage
     assert np.abs(images[3] - images[2]).max() > 1e-3
