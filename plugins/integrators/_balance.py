@@ -65,7 +65,7 @@ def balanced(images: dict[str, np.ndarray], cost: dict[str, float], fixed: set[s
     wanted = np.array([noise[name] / np.sqrt(cost[name]) for name in free])
     costs = np.array([cost[name] for name in free])
     shares = np.ones(len(free))
-    if wanted.any():
+    if np.isfinite(wanted).all() and wanted.any():
         clipped = lambda scale: np.clip(scale * wanted, LEAST, 1 / LEAST)
         more = lambda scale: costs @ clipped(scale) - costs.sum()
         largest = 1 / (LEAST * wanted[wanted > 0].min())

@@ -248,7 +248,7 @@ class EdgeIntegrator(ADIntegrator):
         The noise of each term is measured along the gradients that are set on the parameters, as `render_forward` has
         them: `RUNS` derivatives with `spp` samples per pixel. From then on, in derivatives forward and backward, each
         term takes its share of the samples per pixel that are asked for, at least one. What a number of samples was
-        given for in the scene file ("sppc", "sppp", "sppi") keeps that. Estimates stay without bias whatever the
+        given for in the scene file ("sppc", "sppp", "sppi") has the share 1. Estimates stay without bias whatever the
         shares. Frozen functions that were recorded before keep the shares of that time.
 
         Returns
@@ -257,7 +257,8 @@ class EdgeIntegrator(ADIntegrator):
 
         Raises
         ------
-        RuntimeError : none of the parameters carries a gradient, or `dr.freeze` records.
+        RuntimeError : none of the parameters carries a gradient, the derivatives along these are zero or not finite, or
+            `dr.freeze` records.
         """
         if not self.BALANCES:
             raise Refusal(f"{self.name} does not divide its samples; direct_edge or prb_edge does")
@@ -272,6 +273,13 @@ class EdgeIntegrator(ADIntegrator):
         cost = {term.name: term.effort * plans[term.name].samples * plans[term.name].rays for term in self.TERMS}
         fixed = {term.name for term in self.TERMS if getattr(self, term.of_property)}
         found = balanced({name: np.array([image[name] for image in images]) for name in cost}, cost, fixed)
+        total = sum(found.noise.values())
+        if not 0 < total < np.inf:
+            what = "zero" if total == 0 else "not finite"
+            raise Refusal(
+                f"{self.name}: the derivatives to be measured are {what}: set gradients on the parameters along a motion "
+                "that shows, as for `render_forward`"
+            )
         self.shares = found.shares
         return found
 

@@ -122,6 +122,11 @@ def test_what_cannot_be_measured_is_refused():
     integrator = mi.load_dict({"type": "direct_edge"})
     with pytest.raises(RuntimeError, match="none of the parameters carries a gradient"):
         integrator.balance(scene, motion.params)
+    dr.enable_grad(motion.params["blocker.vertex_positions"])  # but along no motion
+    motion.params.update()
+    with pytest.raises(RuntimeError, match="measured are zero"):
+        integrator.balance(scene, motion.params, spp=1)
+    assert integrator.shares == {}
     attach(motion)
     for kind in ("rig", "aov_edge"):
         other = mi.load_dict({"type": kind, **({"aovs": "dd:depth"} if kind == "aov_edge" else {})})
