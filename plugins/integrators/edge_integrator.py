@@ -277,8 +277,8 @@ class EdgeIntegrator(ADIntegrator):
         if not 0 < total < np.inf:
             what = "zero" if total == 0 else "not finite"
             raise Refusal(
-                f"{self.name}: the derivatives to be measured are {what}: set gradients on the parameters along a motion "
-                "that shows, as for `render_forward`"
+                f"{self.name}: the derivatives to be measured are {what}: set gradients on the parameters along a "
+                "motion that shows, as for `render_forward`"
             )
         self.shares = found.shares
         return found
