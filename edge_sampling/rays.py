@@ -56,6 +56,22 @@ def spawn_ray_to(scene: mi.Scene, si: mi.SurfaceInteraction3f, p: mi.Point3f) ->
     return ray
 
 
+def spawn_ray_to_light(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f) -> mi.Ray3f:
+    """The ray from `si` to just before the sampled point of a light; it has no end if the light is at infinity.
+
+    Mitsuba lets rays to an environment end behind the scene. In a frozen function that changes parameters, a replay may
+    read another radius of the scene there than the one that was recorded (Dr.Jit 1.5): it does not write into the data
+    of virtual functions what was made from a constant during the recording. So that length is not used.
+    """
+    far = [bool(e.flags() & mi.EmitterFlags.Infinite) for e in scene.emitters()]
+    if not any(far):
+        return spawn_ray_to(scene, si, ds.p)
+    endless = spawn_ray(scene, si, ds.d)
+    if all(far):
+        return endless
+    return dr.select(mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite), endless, spawn_ray_to(scene, si, ds.p))
+
+
 def lift(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
     """How far above a surface rays start at its point p: mi.Float, (N,), scene units."""
     reach = dr.max(dr.abs(p))

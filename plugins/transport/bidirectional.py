@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
+from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to, spawn_ray_to_light
 
 from .emission import Emission
 from .film_views import FilmViews
@@ -105,7 +105,7 @@ class CameraPaths:
         w = weight(met, light.arrival / light.pdf * dr.abs_dot(si.n, light.ds.d) * here.shorter)
         L = here.f * light.weight * w
         active &= dr.any(L != 0)
-        active &= ~self.scene.ray_test(spawn_ray_to(self.scene, si, light.ds.p), active)
+        active &= ~self.scene.ray_test(spawn_ray_to_light(self.scene, si, light.ds), active)
         return dr.select(active, L, 0)
 
     def _connected(self, si, bsdf, shorter: Shorter, number, light: LightVertex, active) -> mi.Spectrum:

@@ -12,7 +12,7 @@ from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below
 from rimlight.edge_sampling.parametrisation import Parametrisation, Vicinity, shown_by_mirror
-from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
+from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to_light
 
 
 @dataclass
@@ -164,7 +164,7 @@ class Scattering:
             active &= dr.any(f != 0) | (pdf > 0)  # what is black may still become brighter
         else:
             return L
-        active &= ~self.scene.ray_test(spawn_ray_to(self.scene, si, ds.p), active)
+        active &= ~self.scene.ray_test(spawn_ray_to_light(self.scene, si, ds), active)
         with dr.resume_grad(when=self.attached):
             return dr.select(active, L, 0)
 
@@ -174,7 +174,7 @@ class Scattering:
         scene = self.scene
         on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
         # One ray answers both questions: is the light visible, and which of its triangles is y on?
-        ray = spawn_ray_to(scene, si, ds.p)
+        ray = spawn_ray_to_light(scene, si, ds)
         before = mi.Float(ray.maxt)
         ray.maxt = dr.select(on_surface, 2 * dr.norm(ds.p - ray.o) - ray.maxt, ray.maxt)
         pi = scene.ray_intersect_preliminary(ray, active=active)

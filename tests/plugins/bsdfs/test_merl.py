@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import textwrap
-import warnings
 from functools import cache
 from pathlib import Path
 
@@ -673,15 +672,8 @@ def test_frozen(table):
     for i in range(4):
         arguments = lambda i=i: (scene, params, initial, dr.opaque(mi.Float, 1 + 0.5 * i), dr.opaque(mi.UInt32, 3))
         (image, gradient), (expected, its_gradient) = frozen(*arguments()), step(*arguments())
-        # Unexplained: late in long runs of many tests, the third call, a replay, had one wrong pixel. It is not
-        # rounding: no small change of the table, the floor or the camera moves that pixel. By itself, this test sees
-        # no difference.
-        same = np.isclose(np.array(image), np.array(expected), rtol=1e-4, atol=1e-5)
-        if not same.all():
-            warnings.warn(f"a replay differs in {(~same).any(2).sum()} pixel, at call {i}", stacklevel=1)
-        assert (~same).any(2).sum() <= 1
-        np.testing.assert_allclose(np.array(image), np.array(expected), rtol=0.1)
-        assert gradient[0] == pytest.approx(its_gradient[0], rel=1e-3) and gradient[0] > 0
+        np.testing.assert_allclose(np.array(image), np.array(expected), rtol=1e-4, atol=1e-5)
+        assert gradient[0] == pytest.approx(its_gradient[0], rel=1e-4) and gradient[0] > 0
         images.append(np.array(image))
     assert frozen.n_recordings <= 2  # the first call makes the film's storage
     assert np.abs(images[3] - images[2]).max() > 1e-3

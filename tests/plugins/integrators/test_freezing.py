@@ -17,6 +17,7 @@ from frozen import (
     losses_and_gradients,
     moved,
     numbers,
+    spoil_free_memory,
 )
 
 VALUES = [
@@ -113,6 +114,29 @@ def test_whole_step_of_a_material():
     np.testing.assert_allclose(fit(frozen), expected, rtol=1e-5)
     assert frozen.n_recordings <= 2
     assert np.abs(expected.ravel() - [0.7, 0.3, 0.4]).max() > 0.05
+
+
+@pytest.mark.parametrize("kind", ["direct_edge", "prb_edge", "bdpt"])
+@pytest.mark.parametrize("sky", [cases.constant, cases.surroundings], ids=["constant", "envmap"])
+def test_update_under_a_sky(kind, sky):
+    """An update inside tells the sky how large the scene is. That number is lost in replays (Dr.Jit 1.5)."""
+    floor = cases.horizontal((0, -1, 0), 3, "floor", bsdf=cases.diffuse(0.5, two_sided=True))
+    scene = cases.scene(sensor=cases.camera(), floor=floor, ball={"type": "sphere", "radius": 0.6}, sky=sky())
+    integrator, key = mi.load_dict({"type": kind}), "floor.bsdf.brdf_0.reflectance.value"
+
+    def step(scene, value, seed):
+        params = mi.traverse(scene)
+        params[key] = value * mi.Color3f(1, 0.5, 0.8)
+        params.update()
+        return mi.render(scene, integrator=integrator, spp=4, seed=seed)
+
+    frozen = dr.freeze(step)
+    for i in range(4):
+        arguments = scene, dr.opaque(mi.Float, 0.2 * (i + 1)), dr.opaque(mi.UInt32, 1)
+        expected = np.array(step(*arguments))
+        spoil_free_memory()
+        np.testing.assert_allclose(np.array(frozen(*arguments)), expected, rtol=1e-4, atol=1e-5)
+    assert frozen.n_recordings <= 2 and expected.std() > 0.05
 
 
 def test_fit_of_a_shape():
