@@ -50,6 +50,8 @@ def load(path: Path, who: str = "fit") -> tuple[dict[str, np.ndarray], dict[str,
     OSError : it cannot be read.
     """
     try:
+        if path.is_file() and not zipfile.is_zipfile(path):  # of which NumPy would say how to load it all the same
+            raise ValueError("it is no archive")
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             facts = json.loads(str(file["facts"]))
             arrays = {name.removeprefix("array/"): file[name] for name in file.files if name != "facts"}

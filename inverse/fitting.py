@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import logging
 import shutil
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +21,7 @@ from . import problem as problems
 from . import result as results
 from .executors import Executor, Here
 from .free_parameters import to_numpy
+from .interruption import listening
 from .optimisers import Optimiser
 from .problem import Problem
 from .progress import Progress, Segment, Step
@@ -91,15 +89,16 @@ class Fit:
         resume: bool = False,
         executor: Executor | None = None,
         tensorboard: bool = False,
-        regularisers: Sequence[Regulariser] = (),
-        on_step: Sequence[Callable[[Step], Any]] = (),
+        regularisers: Regulariser | Sequence[Regulariser] = (),
+        on_step: Callable[[Step], Any] | Sequence[Callable[[Step], Any]] = (),
         **fields: Any,
     ):
         if problem is not None and fields:
             raise InputError(f"fit: give a problem or its fields, not both: {', '.join(fields)}")
         self.problem = Problem(**fields) if problem is None else problem
         self.file = None if out is None else Path(out) / "checkpoint.npz"
-        self.regularisers, self._callbacks = tuple(regularisers), list(on_step)
+        several = lambda given: [given] if callable(given) else list(given)
+        self.regularisers, self._callbacks = several(regularisers), several(on_step)
         self.status = "running"
         if tensorboard and self.file is None:
             raise InputError("fit: to write a log for TensorBoard, name a folder")
@@ -114,6 +113,8 @@ class Fit:
             else:
                 self._begin()
         if not resume and self.file is not None:
+            if self.file.exists():
+                log.warning('"%s" of a former fit is replaced; resume=True would go on from it', self.file)
             self.file.parent.mkdir(parents=True, exist_ok=True)
             problems.write(self.file.parent / "problem.toml", self.problem)
             self.save(self.file)
@@ -153,7 +154,7 @@ class Fit:
         Ctrl-C ends the fit after the present step, with a result; pressed twice, at once.
         """
         with (
-            self._listening(),
+            listening(self._interrupt),
             tqdm(total=self.total, initial=self.progress.step, desc="fit", disable=None if progress else True) as bar,
         ):
             for _ in self:
@@ -185,7 +186,9 @@ class Fit:
         self._save()
 
     def step(self) -> Step:
-        """Take one step of the plan, and tell the functions of `on_step`."""
+        """Take one step of the plan, and tell the functions of `on_step`. RuntimeError : none is left."""
+        if self.progress.segment >= len(self.plan):
+            raise RuntimeError(f"fit: there is no step left of {self.progress.step}")
         self._clock_starts()
         with alone(self.problem.variant):
             step = self._step()
@@ -283,6 +286,10 @@ class Fit:
         except KeyError as error:
             free = ", ".join(attached)
             raise InputError(f"fit: a regulariser asks for {error}, which is not free; free are {free}") from None
+        if strange := [type(part).__name__ for part in parts if not dr.is_diff_v(part)]:
+            raise InputError(
+                f"fit: a regulariser must return a number of Dr.Jit, which has a derivative, got {strange[0]}"
+            )
         return sum((dr.sum(part.array if dr.is_tensor_v(part) else part) for part in parts), mi.Float(0))
 
     def silent(self) -> list[str]:
@@ -396,24 +403,11 @@ class Fit:
             shown[label.split(" (")[0]] = f"{numbers[-1]:.2e}"
         return shown
 
-    # ---------------------- Interruption ----------------------
+    def _interrupt(self) -> None:
+        self.stop("interrupted")
+        log.warning("interrupted: the fit ends after this step, with a result; Ctrl-C ends it at once")
 
-    @contextmanager
-    def _listening(self) -> Iterator[None]:
-        """Within it, Ctrl-C ends the loop after the present step; pressed again, at once."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def stop(number: int, frame: Any) -> None:
-            self.stop("interrupted")
-            signal.signal(signal.SIGINT, previous)
-
-        previous = signal.signal(signal.SIGINT, stop)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, previous)
+    # ---------------------- Checkpoints ----------------------
 
     def save(self, file: Path | str) -> None:
         """Write a checkpoint, from which `load` goes on. OSError : it cannot be written; the last one stays."""

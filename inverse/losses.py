@@ -24,6 +24,7 @@ from skimage.transform import pyramid_reduce
 from rimlight.loading import InputError
 
 from .classifier import Classifier
+from .conforming import conform
 
 #: In the denominator of `relative`, squared radiance.
 FLOOR = 0.01
@@ -170,6 +171,9 @@ class Loss:
     channel: str | None = None
     """Name of the channel of `aov_edge` that is compared, such as a depth map or a mask. The target holds its numbers
     as they are. Default: none, for integrators that render nothing but light."""
+
+    def __post_init__(self) -> None:
+        conform(self)
 
 
 def function(loss: Loss, norm: Norm | None = None) -> LossFunction:

@@ -52,7 +52,8 @@ def numbers(source: Any) -> np.ndarray:
         source = source.detach().cpu()
     array = np.asarray(source)
     if array.dtype.kind not in "fiub":
-        raise InputError(f"fit: a picture is a path, an array or a tensor, got {type(source).__name__}")
+        what = f"an array of {array.dtype}" if array.ndim else type(source).__name__
+        raise InputError(f"fit: a picture is a path, an array or a tensor, got {what}")
     return array
 
 

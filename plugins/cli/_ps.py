@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import logging
-import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,6 +13,7 @@ import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from rimlight.exr import read_exr, remove_left_over
+from rimlight.inverse.interruption import listening
 from rimlight.inverse.photometric_stereo import (
     calibration,
     cost,
@@ -100,17 +97,18 @@ class Run:
 
     def _reconstruct(self, data: dataset.Dataset, truth: np.ndarray | None) -> int:
         found: reconstruction.Result | None = None
+        pressed: list[bool] = []
 
         def after(result: reconstruction.Result) -> None:
             nonlocal found
             found = output.snapshot(result)
             output.write_numbers(self.out, found, self.options, status="running", truth=truth)
-            if stopped:
+            if pressed:
                 raise KeyboardInterrupt
 
         status = "finished"
         try:
-            with _listening() as stopped:
+            with listening(lambda: pressed.append(True)):
                 found = reconstruction.reconstruct(
                     data,
                     self.options,
@@ -221,26 +219,6 @@ class Ps:
 
     def run(self) -> int:
         return self.command.run()
-
-
-@contextmanager
-def _listening() -> Iterator[list[bool]]:
-    """Within it, Ctrl-C only adds to the list that it gives, for the end of the alternation: in the midst of one, it
-    may leave Dr.Jit in the midst of a loop. Pressed again, it interrupts at once."""
-    pressed: list[bool] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield pressed
-        return
-
-    def press(*_) -> None:
-        pressed.append(True)
-        signal.signal(signal.SIGINT, previous)
-
-    previous = signal.signal(signal.SIGINT, press)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def _true_depth(folder: Path) -> np.ndarray | None:
