@@ -4,15 +4,14 @@ scenes, pictures, losses and optimisers in memory besides."""
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import cattrs
+import numpy as np
 import tomli_w
 from cattrs.gen import make_dict_structure_fn
 from cattrs.strategies import configure_union_passthrough
@@ -142,11 +141,14 @@ class Stage:
 
     def factor(self, iteration: int) -> float:
         """Factor of all rates in a step of the stage. InputError : a schedule says nonsense."""
-        first = self.rate(iteration) if callable(self.rate) else self.rate
-        if callable(self.rate) and not (isinstance(first, Real) and 0 <= first < math.inf):
-            raise InputError(
-                f"fit: the schedule of a stage must return a number >= 0, got {first!r} at step {iteration}"
-            )
+        first: Any = self.rate
+        if callable(first):
+            first = np.asarray(first(iteration))  # those of other libraries return arrays without dimensions
+            if first.shape or first.dtype.kind not in "fiu" or not 0 <= first < np.inf:
+                said = " ".join(repr(first.tolist()).split())
+                raise InputError(
+                    f"fit: the schedule of a stage must return a number >= 0, got {said} at step {iteration}"
+                )
         return float(first * self.decay ** (iteration / max(self.iterations - 1, 1)))
 
 

@@ -198,6 +198,7 @@ def resample(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     a picture that is too small, linear."""
     if image.shape[:2] == size:
         return image
+    # Pillow's box filter takes pixels whole or not at all: 0.24 off, at 512 → 200 pixels of white noise in [0, 1]
     if any(new > old for new, old in zip(size, image.shape, strict=False)):
         return resize(image, size, order=1, preserve_range=True).astype(np.float32)
     down, across = (_shares(old, new) for old, new in zip(image.shape, size, strict=False))

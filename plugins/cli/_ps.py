@@ -89,7 +89,7 @@ class Run:
         pixels, images = int(setup.mask.sum()), len(setup.names)
         near = setup.near or setup.away is not None
         needed = cost.memory(pixels, images, self.options, near=near)
-        if (there := cost.available_memory()) is not None and needed > there:
+        if needed > (there := cost.available_memory()):
             raise InputError(
                 f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
                 f"{there / 2**30:.1f} GiB are available; use fewer of the --images, or smaller --resolutions"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import psutil
 import pytest
 from pages import Page, in_browser
 
@@ -429,6 +430,19 @@ def test_disk_that_fails(folder, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(output, "write_exr", full)
     refused(capfd, ["run", str(folder), "--out", str(tmp_path / "out"), *QUICK, "--no-reflectance"], "No space left")
     assert not list((tmp_path / "out").glob("*.exr"))
+
+
+def test_a_control_group_limits_memory(tmp_path, monkeypatch):
+    """What the system keeps of files counts as free; a group without a limit does not count."""
+    files = [tmp_path / name for name in ("max", "current", "stat")]
+    monkeypatch.setattr(cost, "GROUPS", (tuple(map(str, files)),))
+    machine = cost.available_memory()
+    assert 2**20 < machine <= psutil.virtual_memory().total
+    for file, text in zip(files, ("5000", "3000", "anon 2000\ninactive_file 700\n"), strict=True):
+        file.write_text(text)
+    assert cost.available_memory() == 5000 - 3000 + 700
+    files[0].write_text("max\n")
+    assert cost.available_memory() > 2**20
 
 
 def test_memory_is_checked(folder, tmp_path, capfd, monkeypatch):
