@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -17,7 +16,7 @@ from rimlight import inverse
 from rimlight.inverse import Free, Problem
 from rimlight.loading import InputError, expected
 
-from ._loading import at_least, check_output
+from ._loading import at_least, check_output, show_warnings
 
 #: What is shown by --help before there is a file.
 EXAMPLE = Problem(scene=Path("scene.xml"), free=(Free(key=("shape.vertex_positions",), kind="pose"),))
@@ -57,7 +56,7 @@ class Fit:
                 kinds = ", ".join(sorted({f.kind for f in problem.free}))
                 raise InputError(f'nothing of the kind "{self.kind}" is free in "{self.config}", only {kinds}')
             problem = dataclasses.replace(problem, free=free)
-        _show_warnings()
+        show_warnings()
         with ExitStack() as stack, expected(OSError):
             executor = None
             if self.cluster is not None or self.workers:
@@ -73,13 +72,6 @@ class Fit:
             inverse.write(self.out, found, title=self.config.stem)
         print(f"report: {self.out / 'report.html'}")
         return {"finished": 0, "out of time": 0, "interrupted": 130}.get(found.status, 1)
-
-
-def _show_warnings() -> None:
-    """Of Rimlight; what Dask says of its workers' lives and deaths is said again in a line of ours."""
-    handler = logging.StreamHandler()
-    handler.addFilter(lambda record: not record.name.startswith("distributed"))
-    logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s", handlers=[handler])
 
 
 def _print(found: inverse.Result) -> None:
@@ -145,7 +137,7 @@ class Reproduce:
         at_least(1, seeds=self.seeds)
         at_least(0, workers=self.workers)
         check_output(self.out, folder=True)
-        _show_warnings()
+        show_warnings()
         with ExitStack() as stack, expected(OSError):
             workers = None
             if self.cluster is not None or self.workers:

@@ -217,6 +217,30 @@ def test_run_writes_everything(folder, result):
     assert np.loadtxt(out / "exposures.txt") == pytest.approx(np.ones(LIGHTS))
 
 
+def test_several_data_sets_on_workers(folder, result, tmp_path, capfd):
+    """What is wrong with one does not stop the others, and is not done again."""
+    pytest.importorskip("distributed")
+    (tmp_path / "empty").mkdir()
+    one = ["--materials", "one", "--coat", "False"]
+    arguments = ["ps", "run", str(folder), str(tmp_path / "empty"), "--out", str(tmp_path / "out"), *QUICK, *one]
+    assert main([*arguments, "--brightness", "0", "--workers", "1"]) == 2
+    said = capfd.readouterr().out.splitlines()
+    assert said[0].startswith("bowl: finished: ") and said[-1].startswith("empty: ps: there is no file")
+    both = [json.loads((out / "metadata.json").read_text()) for out in (result[0], tmp_path / "out" / "bowl")]
+    assert both[0]["status"] == both[1]["status"] == "finished"
+    normals = [read_exr(out / "normals.exr")[0][""] for out in (result[0], tmp_path / "out" / "bowl")]
+    assert np.abs(normals[0] - normals[1]).mean() < 2e-3
+    assert main([*arguments, "--brightness", "0"]) == 2
+    assert "bowl" in (refused := capfd.readouterr().err) and "holds a result already" in refused
+    assert main([*arguments, "--brightness", "0", "--resume"]) == 2
+    assert capfd.readouterr().out.startswith("bowl: finished already: ")
+
+
+def test_data_sets_need_different_names(folder, tmp_path, capfd):
+    assert main(["ps", "run", str(folder), str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "data sets need different names, got bowl, bowl" in capfd.readouterr().err
+
+
 def test_page_shows_the_result(result):
     out, _ = result
     source = (out / "report.html").read_text("utf-8")
@@ -451,7 +475,7 @@ def test_memory_is_checked(folder, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(cost, "available_memory", lambda: needed - 1)
     run = ["run", str(folder), "--out", str(tmp_path / "out")]
     refused(capfd, run, f"{K} images of {P} pixels", "GiB", "--images", "--resolutions")
-    monkeypatch.setattr(_ps.Run, "_reconstruct", lambda *_: 0)
+    monkeypatch.setattr(_ps.Run, "_reconstruct", lambda *_: (0, []))
     assert main(["ps", *run, "--images", str(K - 1)]) == 0
     assert main(["ps", *run, "--resolutions", "0.5", "--iterations", "1"]) == 0
 
