@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from tyro.conf import Positional, arg
 
 from rimlight import inverse
@@ -17,6 +18,9 @@ from rimlight.inverse import Free, Problem
 from rimlight.loading import InputError, expected
 
 from ._loading import at_least, check_output, show_warnings
+
+#: Of more views than so, their mean is printed; the report has all.
+FEW_VIEWS = 4
 
 #: What is shown by --help before there is a file.
 EXAMPLE = Problem(scene=Path("scene.xml"), free=(Free(key=("shape.vertex_positions",), kind="pose"),))
@@ -78,11 +82,17 @@ def _print(found: inverse.Result) -> None:
     print(f"{found.status}: {len(found.losses)} steps in {found.seconds:.1f} s")
     for label, errors in found.errors.items():
         print(f"  {label}: {errors[0]:.4g} -> {errors[-1]:.4g}")
-    for i, measures in enumerate(found.measures):
-        for label, (before, after) in measures.items():
-            print(f"  view {i}, {label}: {before:.4g} -> {after:.4g}")
+    count = len(found.measures)
+    of_views = (
+        {f"view {i}": [i] for i in range(count)} if count <= FEW_VIEWS else {f"mean of {count} views": range(count)}
+    )
+    for name, views in of_views.items():
+        for label in found.measures[0]:
+            before, after = np.mean([found.measures[i][label] for i in views], axis=0)
+            print(f"  {name}, {label}: {before:.4g} -> {after:.4g}")
         if found.floors:
-            print(f"  view {i}, root mean square error at the truth (noise): {found.floors[i]:.4g}")
+            noise = np.mean([found.floors[i] for i in views])
+            print(f"  {name}, root mean square error at the truth (noise): {noise:.4g}")
     if found.skipped:
         print(f"  {found.skipped} steps were left out: a number would not have been finite")
     for name in found.silent:
