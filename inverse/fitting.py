@@ -25,7 +25,7 @@ from .interruption import listening
 from .optimisers import Optimiser
 from .problem import Problem
 from .progress import Progress, Segment, Step
-from .regularisers import Regulariser
+from .regularisers import Regulariser, penalty_of
 from .renderer import Renderer, alone
 from .result import WINDOW, Result
 from .tensorboard import TensorBoard
@@ -133,6 +133,7 @@ class Fit:
         self.truth_is_known = problem.compares and all(target.file is None for target in problem.target)
         self.optimiser = Optimiser(self.parameters, problem)
         self.start = self.latents()
+        self._check_starts()
         stages, starts = list(enumerate(problem.stage)), problem.starts.count
         explored = [Segment(*stages[0], k) for k in range(starts)] if starts > 1 else [Segment(*stages[0])]
         self.plan = [*explored, *(Segment(*entry) for entry in stages[1:])]
@@ -239,7 +240,7 @@ class Fit:
         found = self.executor.gradient(values, tasks)
         loss = float(np.mean([found.losses[task.key] for task in tasks]))
         gradients: dict[str, Any] = {key: found.gradients.get(key, np.float32(0)) / len(tasks) for key in values}
-        penalty = self._penalty(attached)
+        penalty = penalty_of(self.regularisers, attached)
         if penalty is not None:
             loss += float(np.array(dr.detach(penalty)).item())
         scores = [found.scores[task.key] for task in tasks]
@@ -276,21 +277,6 @@ class Fit:
         """Keep the first and the last picture of the first view that have the present size, for who watches."""
         self.before = image if self.before is None or self.before.shape != image.shape else self.before
         self.image = image
-
-    def _penalty(self, attached: Mapping[str, Any]) -> Any:
-        """The sum of the regularisers, attached, or None if there are none."""
-        if not self.regularisers:
-            return None
-        try:
-            parts = [regularise(attached) for regularise in self.regularisers]
-        except KeyError as error:
-            free = ", ".join(attached)
-            raise InputError(f"fit: a regulariser asks for {error}, which is not free; free are {free}") from None
-        if strange := [type(part).__name__ for part in parts if not dr.is_diff_v(part)]:
-            raise InputError(
-                f"fit: a regulariser must return a number of Dr.Jit, which has a derivative, got {strange[0]}"
-            )
-        return sum((dr.sum(part.array if dr.is_tensor_v(part) else part) for part in parts), mi.Float(0))
 
     def silent(self) -> list[str]:
         """Names of parameters whose gradient was always 0."""
@@ -376,6 +362,14 @@ class Fit:
         spread = self.problem.starts
         scattered = [p.scatter(rng, spread.move, spread.turn, spread.value) for p in self.parameters]
         return {name: latent for of_one in scattered for name, latent in of_one.items()}
+
+    def _check_starts(self) -> None:
+        """InputError : several starts are the same, since what is spread is not free."""
+        second = self._start(1) if self.problem.starts.count > 1 else {}
+        if second and all(np.array_equal(second[name], start) for name, start in self.start.items()):
+            raise InputError(
+                "fit: all starts are the same: starts.move and starts.turn spread rigid bodies, starts.value all else"
+            )
 
     def latents(self) -> dict[str, np.ndarray]:
         """What the optimiser holds: name -> array."""

@@ -250,6 +250,9 @@ def drjit_loss(function: Callable[[Any, Any, Any], Any], label: str = "") -> Los
         seen, *others = (mi.TensorXf(np.ascontiguousarray(a, np.float32)) for a in (image, target, weight))
         dr.enable_grad(seen)
         value, metrics = value_and_metrics(function(seen, *others))
+        if not dr.is_diff_v(value) or dr.width(value) != 1 or not dr.grad_enabled(value):
+            got = f"{dr.width(value)} of {type(value).__name__}"
+            raise InputError(f"a loss must return one number of Dr.Jit that depends on the image, got {got}")
         dr.backward(value)
         return float(np.array(dr.detach(value)).item()), np.array(dr.grad(seen)).reshape(image.shape), metrics
 

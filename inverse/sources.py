@@ -108,6 +108,8 @@ def _of_scene(scene: mi.Scene) -> str:
 
 
 def _of_file(path: Path) -> str:
+    if not path.is_file():
+        raise FileNotFoundError(f'fit: there is no file "{path}"')
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 

@@ -56,6 +56,7 @@ def test_the_network_of_the_client_drops_for_a_moment(alone, machines: Machines,
     assert "the step is done again" in caplog.text
 
 
+@pytest.mark.slow
 def test_the_network_of_the_client_drops_for_good(machines: Machines, tmp_path):
     machines.add()
     relay = Relay(machines.address)
@@ -65,6 +66,7 @@ def test_the_network_of_the_client_drops_for_good(machines: Machines, tmp_path):
     assert_goes_on(found, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_the_network_of_a_worker_drops(alone, machines: Machines):
     machines.add()
     relay = Relay(machines.address)
@@ -73,6 +75,7 @@ def test_the_network_of_a_worker_drops(alone, machines: Machines):
         assert_same(fit_while(posed(), cluster, 3, relay.close).values, alone)
 
 
+@pytest.mark.slow
 def test_the_scheduler_freezes(machines: Machines, monkeypatch, tmp_path):
     """Its machine still answers for it, so that no connection breaks."""
     machines.add()
@@ -87,12 +90,14 @@ def test_the_scheduler_freezes(machines: Machines, monkeypatch, tmp_path):
 # ------------------------------------------------------------------ disks
 
 
+@pytest.mark.slow
 def test_the_disk_of_a_worker_is_full(alone, machines: Machines):
     worker = machines.add()
     with machines.cluster(posed(), 1) as cluster, disk_full(worker.pid):
         assert_same(fitting.Fit(posed(), executor=cluster).run(progress=False).values, alone)
 
 
+@pytest.mark.slow
 def test_the_disk_of_the_client_is_full(machines: Machines, monkeypatch, tmp_path):
     """The last checkpoint that could be written is the first one."""
     monkeypatch.setattr(fitting, "INTERVAL", 0.0)

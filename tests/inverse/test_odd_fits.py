@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -138,6 +139,20 @@ def test_makers_of_optimisers_take_a_rate():
         inverse.Fit(posed(optimiser=functools.partial(mi.ad.Adam, lr=0.1)))
 
 
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        ({"starts": inverse.Starts(count=3, move=0.1)}, "all starts are the same: starts.move and starts.turn spread"),
+        ({"free": Free(key=BOX, kind="pose", move="", turn="")}, '"box" cannot move'),
+        ({"free": Free(key=BOX, kind="shape", move="")}, '"box" cannot move'),
+        ({"target": ["nothing.png"]}, 'there is no file "nothing.png"'),
+    ],
+)
+def test_fits_of_nothing(options, culprit):
+    with pytest.raises((ValueError, FileNotFoundError), match=f"^fit: {culprit}"):
+        inverse.Fit(posed(**options))
+
+
 # ------------------------------------------------------------------ folders
 
 
@@ -152,6 +167,19 @@ def test_a_checkpoint_that_is_replaced_is_named(tmp_path, caplog):
     assert not caplog.messages
     inverse.Fit(posed(), out=tmp_path)
     assert "of a former fit is replaced; resume=True would go on from it" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("function", "got"),
+    [
+        (lambda image, target, weight: (image - target) ** 2, "561 of TensorXf"),
+        (lambda image, target, weight: 0.5, "1 of float"),
+        (lambda image, target, weight: dr.mean(dr.detach(image) - target, axis=None), "1 of TensorXf"),
+    ],
+)
+def test_losses_of_drjit_that_return_no_number(function, got):
+    with pytest.raises(ValueError, match=f"one number of Dr.Jit that depends on the image, got {got}$"):
+        inverse.Fit(posed(loss=inverse.drjit_loss(function)))
 
 
 # ------------------------------------------------------------------ pictures

@@ -70,7 +70,8 @@ def test_a_fit_stops_when_no_worker_is_left(machines, monkeypatch, tmp_path, cap
     assert resumed.progress.step == len(found.losses)
 
 
-def test_a_fit_stops_when_the_scheduler_is_gone(machines, tmp_path):
+def test_a_fit_stops_when_the_scheduler_is_gone(machines, tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "CONNECT", 3.0)
     machines.add()
     with machines.cluster(posed(), 1) as cluster:
         found = fit_while(posed(), cluster, 3, machines.scheduler.kill, out=tmp_path / "out")
