@@ -34,6 +34,9 @@ POLL = 1.0
 #: Seconds without a sign of life after which a worker counts as lost. Busy ones give signs, too.
 SILENT = 60.0
 
+#: Seconds in which a scheduler must answer. One that is frozen, on a machine that is not, never does.
+ANSWER = 60.0
+
 #: Seconds to wait for the first worker, or for a new one after all were lost.
 PATIENCE = 120.0
 
@@ -294,9 +297,9 @@ class Workers:
             if self.client.status == "running":
                 began = time.monotonic()
                 with suppress(OSError, CancelledError, asyncio.TimeoutError):
-                    return self.client.run_on_scheduler(function, callback_timeout=SILENT, **arguments)
-                if time.monotonic() - began >= SILENT:
-                    raise Lost(f"the scheduler at {self._address} has not answered for {SILENT:.0f} s; {AGAIN}")
+                    return self.client.run_on_scheduler(function, callback_timeout=ANSWER, **arguments)
+                if time.monotonic() - began >= ANSWER:
+                    raise Lost(f"the scheduler at {self._address} has not answered for {ANSWER:.0f} s; {AGAIN}")
             time.sleep(POLL / 4)  # Dask connects again, or gives up
         raise Lost(f"the scheduler at {self._address} is gone; {AGAIN}")
 

@@ -80,7 +80,7 @@ def test_the_scheduler_freezes(machines: Machines, monkeypatch, tmp_path):
     """Its machine still answers for it, so that no connection breaks."""
     machines.add()
     with machines.cluster(posed(), 1) as cluster:
-        monkeypatch.setattr(workers, "SILENT", 4.0)
+        monkeypatch.setattr(workers, "ANSWER", 4.0)
         freeze = lambda: machines.scheduler.send_signal(signal.SIGSTOP)
         found = fit_while(posed(), cluster, 3, freeze, out=tmp_path / "out")
     assert found.status.startswith(f"stopped: the scheduler at {machines.address} has not answered for 4 s")
