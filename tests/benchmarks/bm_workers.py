@@ -27,7 +27,7 @@ import numpy as np
 from distributed import Client, LocalCluster
 
 from rimlight import inverse, scenes
-from rimlight.inverse import Cluster, Free, Problem, Stage, Target, executors
+from rimlight.inverse import Cluster, Free, Problem, Stage, Target, packing
 from rimlight.inverse.renderer import Renderer
 from rimlight.inverse.view import View
 
@@ -283,10 +283,10 @@ def costs(**options) -> Costs:
         began = time.perf_counter()
         client.gather([client.submit(pow, i, 2, pure=False) for i in range(200)])
         task = (time.perf_counter() - began) / 200
-    packed = executors.pack({"a": np.random.default_rng(0).standard_normal(one.size // 4)})
+    packed = packing.pack({"a": np.random.default_rng(0).standard_normal(one.size // 4)})
     began = time.perf_counter()
     for _ in range(5):
-        executors.pack({"a": executors.unpack(packed)["a"] + 1.0})
+        packing.pack({"a": packing.unpack(packed)["a"] + 1.0})
     return Costs(one.gradient / pieces, one.step - one.gradient, task, (time.perf_counter() - began) / 5, one.size)
 
 

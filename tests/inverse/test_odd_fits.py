@@ -158,7 +158,7 @@ def test_fits_of_nothing(options, culprit):
 
 def test_what_is_no_checkpoint(tmp_path):
     (tmp_path / "checkpoint.npz").write_bytes(b"garbage")
-    with pytest.raises(ValueError, match=r"is no checkpoint, or damaged: it is no archive$"):
+    with pytest.raises(ValueError, match=r"is no checkpoint, or damaged: File is not a zip file$"):
         inverse.Fit(posed(), out=tmp_path, resume=True)
 
 

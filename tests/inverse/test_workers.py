@@ -13,7 +13,7 @@ from machines import assert_same, fit_while, posed, run_fit, values_of, wait_for
 
 from rimlight import inverse
 from rimlight.cli import main
-from rimlight.inverse import executors, fitting, workers
+from rimlight.inverse import executors, fitting, packing, workers
 from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Stage, Target
 from rimlight.inverse.renderer import Gradient
@@ -155,11 +155,11 @@ def test_packing_loses_nothing():
     odd = np.resize(np.float64([0, 5e-324, -1e300, np.nan, np.inf, -0.1]), 2000)
     sparse = np.where(rng.random(normal.shape) < 0.3, normal, np.float32(0))
     arrays = {"normal": normal, "sparse": sparse, "zeros": 0 * normal, "odd": odd, "short": normal[0, 0]}
-    there = pickle.loads(pickle.dumps(executors.pack(arrays)))
-    for key, array in executors.unpack(there).items():
+    there = pickle.loads(pickle.dumps(packing.pack(arrays)))
+    for key, array in packing.unpack(there).items():
         np.testing.assert_array_equal(array, arrays[key])
         assert array.dtype == arrays[key].dtype and array.shape == arrays[key].shape
-    size = lambda key: len(pickle.dumps(executors.pack({key: arrays[key]}))) / arrays[key].nbytes
+    size = lambda key: len(pickle.dumps(packing.pack({key: arrays[key]}))) / arrays[key].nbytes
     assert size("normal") < 0.9 and size("sparse") < 0.32 and size("zeros") < 0.01
 
 
