@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 from . import problem as problems
 from .packing import pack, unpack
 from .problem import Problem
@@ -43,6 +45,21 @@ class Here:
         return [function(self.renderer, shared, *call) for call in calls]
 
 
+def executor_of(problem: Problem, executor: Any, renderer: Renderer) -> Executor:
+    """The one that is given, or that of this process. InputError : it is none, or of another problem."""
+    if executor is None:
+        return Here(renderer)
+    if isinstance(executor, type) or not (hasattr(executor, "gradient") and hasattr(executor, "map")):
+        raise InputError(f"fit: an executor has the methods gradient and map, such as a Cluster, got {executor!r}")
+    if isinstance(executor, Cluster):
+        executor.check(problem)
+    return executor
+
+
+def _text(problem: Problem) -> str:
+    return problems.text(problems.relative_to(problem, Path.cwd()))
+
+
 class Cluster:
     """Workers of a Dask cluster, which see the files of the problem under the same paths.
 
@@ -59,11 +76,16 @@ class Cluster:
     """
 
     def __init__(self, problem: Problem, cluster: int | str | Any):
-        self._problem = problems.text(problems.relative_to(problem, Path.cwd()))
+        self._problem = _text(problem)
         problems.check_is_text(self._problem)
         self.pieces = len(problem.target) * problem.parts
         self.parts = problem.parts
         self.workers = Workers(cluster, problem.threads)
+
+    def check(self, problem: Problem) -> None:
+        """InputError : the workers work for another problem, whose pictures they would compare."""
+        if _text(problem) != self._problem:
+            raise InputError("fit: this cluster was made for another problem: make a Cluster of the one that is fitted")
 
     def gradient(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
         seen: dict[int, int] = {}

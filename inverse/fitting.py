@@ -19,7 +19,7 @@ from rimlight.loading import InputError
 from . import batches, free_parameters, progress, sources
 from . import problem as problems
 from . import result as results
-from .executors import Executor, Here
+from .executors import Executor, Here, executor_of
 from .free_parameters import to_numpy
 from .interruption import listening
 from .optimisers import Optimiser
@@ -124,7 +124,7 @@ class Fit:
         if problem.threads is not None:
             dr.set_thread_count(problem.threads)
         self.renderer = Renderer(problem)
-        self.executor: Executor = executor or Here(self.renderer)
+        self.executor = executor_of(problem, executor, self.renderer)
         self.fingerprints = sources.fingerprints(problem, self.renderer.scenes)
         # Stages of one resolution and loss need one check.
         distinct = {(s.resolution, id(n)): i for i, (s, n) in enumerate(zip(problem.stage, problem.norms, strict=True))}

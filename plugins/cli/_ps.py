@@ -63,6 +63,8 @@ class Run:
 
     def run(self) -> int:
         at_least(0, images=self.images, threads=self.threads, workers=self.workers)
+        if not self.folders:
+            raise InputError("name a folder with images, lights and a mask")
         show_warnings()
         elsewhere = self.cluster or self.workers
         if len(self.folders) > 1 or elsewhere:

@@ -139,6 +139,12 @@ def test_makers_of_optimisers_take_a_rate():
         inverse.Fit(posed(optimiser=functools.partial(mi.ad.Adam, lr=0.1)))
 
 
+@pytest.mark.parametrize("executor", [3, inverse.Cluster])
+def test_executors_that_are_none(executor):
+    with pytest.raises(ValueError, match=r"^fit: an executor has the methods gradient and map, such as a Cluster, got"):
+        inverse.Fit(posed(), executor=executor)
+
+
 @pytest.mark.parametrize(
     ("options", "culprit"),
     [

@@ -123,6 +123,16 @@ def test_threads_of_the_same_process_are_refused():
         assert client.status == "running"  # what was given is left as it was
 
 
+def test_a_cluster_works_for_its_own_problem():
+    """Once its workers compared the targets of the other one."""
+    with (
+        distributed.Client(processes=False, dashboard_address=":0", set_as_default=False) as client,
+        executors.Cluster(posed(steps=5), client) as cluster,
+        pytest.raises(ValueError, match="this cluster was made for another problem"),
+    ):
+        inverse.Fit(posed(), executor=cluster)
+
+
 @pytest.mark.parametrize(
     ("cluster", "culprit"), [("nonsense://1", 'no cluster at "nonsense://1"'), (0, "workers must be >= 1, got 0")]
 )

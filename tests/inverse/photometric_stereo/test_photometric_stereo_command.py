@@ -239,6 +239,8 @@ def test_several_data_sets_on_workers(folder, result, tmp_path, capfd):
 def test_data_sets_need_different_names(folder, tmp_path, capfd):
     assert main(["ps", "run", str(folder), str(folder), "--out", str(tmp_path / "out")]) == 2
     assert "data sets need different names, got bowl, bowl" in capfd.readouterr().err
+    assert main(["ps", "run", "--out", str(tmp_path / "out")]) == 2
+    assert "name a folder with images" in capfd.readouterr().err
 
 
 def test_page_shows_the_result(result):
