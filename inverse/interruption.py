@@ -26,3 +26,9 @@ def listening(pressed: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, previous)
+
+
+def dask_setup(worker: Any) -> None:
+    """Called by Dask as a worker of this machine begins. Ctrl-C reaches all processes of a terminal; what it means for
+    the fit, the process of the fit decides alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -26,6 +26,8 @@ import rimlight
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.loading import one_line
 
+from . import interruption
+
 log = logging.getLogger(__name__)
 
 #: Seconds between two looks at who is there, while work is being done.
@@ -113,7 +115,11 @@ class Workers:
         self._mine: list[Any] = []
         if isinstance(cluster, int):
             cluster = LocalCluster(
-                n_workers=cluster, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
+                n_workers=cluster,
+                threads_per_worker=1,
+                dashboard_address=":0",
+                silence_logs=logging.CRITICAL,
+                preload=[interruption.__name__],
             )
             self._mine.append(cluster)
         try:

@@ -37,7 +37,9 @@ def posed(steps: int = 12, **options) -> Problem:
 def run_fit(folder: Path, *options: str) -> subprocess.Popen:
     """`rimlight fit joint fit.toml` in a process of its own, without the derivative image of the report."""
     command = [sys.executable, "-m", "rimlight", "fit", "joint", "fit.toml", *options]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
 
 
 def values_of(folder: Path) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import pickle
 import signal
 
@@ -99,6 +100,22 @@ def test_a_client_that_was_killed_resumes_on_fewer_workers(alone, machines, tmp_
         _, said = process.communicate(timeout=120)
         assert process.returncode == 0, said
     assert_same(values_of(tmp_path / "killed"), values_of(tmp_path / "whole"))
+
+
+@pytest.mark.slow
+def test_an_interruption_of_the_terminal_reaches_the_fit_alone(tmp_path):
+    """Ctrl-C goes to all of its processes. Workers that died of it would be waited for."""
+    problems.write(tmp_path / "fit.toml", posed(stage=(Stage(iterations=4000),)))
+    process = run_fit(tmp_path, "--out", "out", "--workers", "2")
+    file = tmp_path / "out" / "checkpoint.npz"
+    wait_for(file.exists)
+    began = file.read_bytes()
+    wait_for(lambda: file.read_bytes() != began)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=100)
+    assert process.returncode == 130
+    (line,) = said.splitlines()
+    assert line == "rimlight: interrupted: the fit ends after this step, with a result; Ctrl-C ends it at once"
 
 
 # ------------------------------------------------------------------ who may work
