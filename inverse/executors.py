@@ -3,22 +3,21 @@ so that the result does not depend on who did the work."""
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from rimlight.edge_sampling.refusals import InputError
+
 from . import problem as problems
+from .packing import pack, unpack
 from .problem import Problem
 from .renderer import Gradient, Renderer, Task, alone
 from .workers import Workers
-
-#: Arrays of fewer numbers are not packed.
-WORTH = 1000
 
 
 class Executor(Protocol):
@@ -46,6 +45,21 @@ class Here:
         return [function(self.renderer, shared, *call) for call in calls]
 
 
+def executor_of(problem: Problem, executor: Any, renderer: Renderer) -> Executor:
+    """The one that is given, or that of this process. InputError : it is none, or of another problem."""
+    if executor is None:
+        return Here(renderer)
+    if isinstance(executor, type) or not (hasattr(executor, "gradient") and hasattr(executor, "map")):
+        raise InputError(f"fit: an executor has the methods gradient and map, such as a Cluster, got {executor!r}")
+    if isinstance(executor, Cluster):
+        executor.check(problem)
+    return executor
+
+
+def _text(problem: Problem) -> str:
+    return problems.text(problems.relative_to(problem, Path.cwd()))
+
+
 class Cluster:
     """Workers of a Dask cluster, which see the files of the problem under the same paths.
 
@@ -62,11 +76,16 @@ class Cluster:
     """
 
     def __init__(self, problem: Problem, cluster: int | str | Any):
-        self._problem = problems.text(problems.relative_to(problem, Path.cwd()))
+        self._problem = _text(problem)
         problems.check_is_text(self._problem)
         self.pieces = len(problem.target) * problem.parts
         self.parts = problem.parts
         self.workers = Workers(cluster, problem.threads)
+
+    def check(self, problem: Problem) -> None:
+        """InputError : the workers work for another problem, whose pictures they would compare."""
+        if _text(problem) != self._problem:
+            raise InputError("fit: this cluster was made for another problem: make a Cluster of the one that is fitted")
 
     def gradient(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> Gradient:
         seen: dict[int, int] = {}
@@ -123,50 +142,3 @@ def _sum(parts: Sequence[Gradient], last: bool) -> Gradient:
 
 def _for_journey(gradient: Gradient) -> Gradient:
     return replace(gradient, gradients=pack(gradient.gradients))
-
-
-# ------------------------------------------------------------------ what travels
-
-
-@dataclass(frozen=True)
-class Packed:
-    """An array without its zeros, such as the texels that no view sees, and with the highest byte of its numbers, sign
-    and exponent, compressed: nothing is lost.
-
-    places : one bit for each number that is not 0, compressed. highest : bytes of these, compressed. others : (bytes of
-    a number − 1, numbers).
-    """
-
-    shape: tuple[int, ...]
-    kind: np.dtype
-    places: bytes
-    highest: bytes
-    others: np.ndarray
-
-
-def pack(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Arrays of floats, for a journey. Short ones stay as they are."""
-    return {key: array if array.size < WORTH else _packed(array) for key, array in arrays.items()}
-
-
-def unpack(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The inverse of `pack`."""
-    return {key: _unpacked(array) if isinstance(array, Packed) else array for key, array in arrays.items()}
-
-
-def _packed(array: np.ndarray) -> Packed:
-    kind = array.dtype.newbyteorder("<")
-    flat = array.astype(kind).ravel()
-    places = flat != 0
-    planes = flat[places].view(np.uint8).reshape(-1, kind.itemsize).T
-    compress = lambda part: zlib.compress(part.tobytes(), 1)
-    return Packed(array.shape, kind, compress(np.packbits(places)), compress(planes[-1]), planes[:-1].copy())
-
-
-def _unpacked(packed: Packed) -> np.ndarray:
-    whole = np.zeros(np.prod(packed.shape, dtype=int), packed.kind)
-    bits = np.frombuffer(zlib.decompress(packed.places), np.uint8)
-    planes = np.concatenate([packed.others, [np.frombuffer(zlib.decompress(packed.highest), np.uint8)]])
-    numbers = np.ascontiguousarray(planes.T).view(packed.kind).ravel()
-    whole[np.unpackbits(bits, count=whole.size).astype(bool)] = numbers
-    return whole.reshape(packed.shape)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import logging
 import shutil
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +19,13 @@ from rimlight.loading import InputError
 from . import batches, free_parameters, progress, sources
 from . import problem as problems
 from . import result as results
-from .executors import Executor, Here
+from .executors import Executor, Here, executor_of
 from .free_parameters import to_numpy
+from .interruption import listening
 from .optimisers import Optimiser
 from .problem import Problem
 from .progress import Progress, Segment, Step
-from .regularisers import Regulariser
+from .regularisers import Regulariser, penalty_of
 from .renderer import Renderer, alone
 from .result import WINDOW, Result
 from .tensorboard import TensorBoard
@@ -91,15 +89,16 @@ class Fit:
         resume: bool = False,
         executor: Executor | None = None,
         tensorboard: bool = False,
-        regularisers: Sequence[Regulariser] = (),
-        on_step: Sequence[Callable[[Step], Any]] = (),
+        regularisers: Regulariser | Sequence[Regulariser] = (),
+        on_step: Callable[[Step], Any] | Sequence[Callable[[Step], Any]] = (),
         **fields: Any,
     ):
         if problem is not None and fields:
             raise InputError(f"fit: give a problem or its fields, not both: {', '.join(fields)}")
         self.problem = Problem(**fields) if problem is None else problem
         self.file = None if out is None else Path(out) / "checkpoint.npz"
-        self.regularisers, self._callbacks = tuple(regularisers), list(on_step)
+        several = lambda given: [given] if callable(given) else list(given)
+        self.regularisers, self._callbacks = several(regularisers), several(on_step)
         self.status = "running"
         if tensorboard and self.file is None:
             raise InputError("fit: to write a log for TensorBoard, name a folder")
@@ -114,6 +113,8 @@ class Fit:
             else:
                 self._begin()
         if not resume and self.file is not None:
+            if self.file.exists():
+                log.warning('"%s" of a former fit is replaced; resume=True would go on from it', self.file)
             self.file.parent.mkdir(parents=True, exist_ok=True)
             problems.write(self.file.parent / "problem.toml", self.problem)
             self.save(self.file)
@@ -123,7 +124,7 @@ class Fit:
         if problem.threads is not None:
             dr.set_thread_count(problem.threads)
         self.renderer = Renderer(problem)
-        self.executor: Executor = executor or Here(self.renderer)
+        self.executor = executor_of(problem, executor, self.renderer)
         self.fingerprints = sources.fingerprints(problem, self.renderer.scenes)
         # Stages of one resolution and loss need one check.
         distinct = {(s.resolution, id(n)): i for i, (s, n) in enumerate(zip(problem.stage, problem.norms, strict=True))}
@@ -132,6 +133,7 @@ class Fit:
         self.truth_is_known = problem.compares and all(target.file is None for target in problem.target)
         self.optimiser = Optimiser(self.parameters, problem)
         self.start = self.latents()
+        self._check_starts()
         stages, starts = list(enumerate(problem.stage)), problem.starts.count
         explored = [Segment(*stages[0], k) for k in range(starts)] if starts > 1 else [Segment(*stages[0])]
         self.plan = [*explored, *(Segment(*entry) for entry in stages[1:])]
@@ -153,7 +155,7 @@ class Fit:
         Ctrl-C ends the fit after the present step, with a result; pressed twice, at once.
         """
         with (
-            self._listening(),
+            listening(self._interrupt),
             tqdm(total=self.total, initial=self.progress.step, desc="fit", disable=None if progress else True) as bar,
         ):
             for _ in self:
@@ -185,7 +187,9 @@ class Fit:
         self._save()
 
     def step(self) -> Step:
-        """Take one step of the plan, and tell the functions of `on_step`."""
+        """Take one step of the plan, and tell the functions of `on_step`. RuntimeError : none is left."""
+        if self.progress.segment >= len(self.plan):
+            raise RuntimeError(f"fit: there is no step left of {self.progress.step}")
         self._clock_starts()
         with alone(self.problem.variant):
             step = self._step()
@@ -236,7 +240,7 @@ class Fit:
         found = self.executor.gradient(values, tasks)
         loss = float(np.mean([found.losses[task.key] for task in tasks]))
         gradients: dict[str, Any] = {key: found.gradients.get(key, np.float32(0)) / len(tasks) for key in values}
-        penalty = self._penalty(attached)
+        penalty = penalty_of(self.regularisers, attached)
         if penalty is not None:
             loss += float(np.array(dr.detach(penalty)).item())
         scores = [found.scores[task.key] for task in tasks]
@@ -273,17 +277,6 @@ class Fit:
         """Keep the first and the last picture of the first view that have the present size, for who watches."""
         self.before = image if self.before is None or self.before.shape != image.shape else self.before
         self.image = image
-
-    def _penalty(self, attached: Mapping[str, Any]) -> Any:
-        """The sum of the regularisers, attached, or None if there are none."""
-        if not self.regularisers:
-            return None
-        try:
-            parts = [regularise(attached) for regularise in self.regularisers]
-        except KeyError as error:
-            free = ", ".join(attached)
-            raise InputError(f"fit: a regulariser asks for {error}, which is not free; free are {free}") from None
-        return sum((dr.sum(part.array if dr.is_tensor_v(part) else part) for part in parts), mi.Float(0))
 
     def silent(self) -> list[str]:
         """Names of parameters whose gradient was always 0."""
@@ -370,6 +363,14 @@ class Fit:
         scattered = [p.scatter(rng, spread.move, spread.turn, spread.value) for p in self.parameters]
         return {name: latent for of_one in scattered for name, latent in of_one.items()}
 
+    def _check_starts(self) -> None:
+        """InputError : several starts are the same, since what is spread is not free."""
+        second = self._start(1) if self.problem.starts.count > 1 else {}
+        if second and all(np.array_equal(second[name], start) for name, start in self.start.items()):
+            raise InputError(
+                "fit: all starts are the same: starts.move and starts.turn spread rigid bodies, starts.value all else"
+            )
+
     def latents(self) -> dict[str, np.ndarray]:
         """What the optimiser holds: name -> array."""
         return dict(self.optimiser.latents())
@@ -396,24 +397,11 @@ class Fit:
             shown[label.split(" (")[0]] = f"{numbers[-1]:.2e}"
         return shown
 
-    # ---------------------- Interruption ----------------------
+    def _interrupt(self) -> None:
+        self.stop("interrupted")
+        log.warning("interrupted: the fit ends after this step, with a result; Ctrl-C ends it at once")
 
-    @contextmanager
-    def _listening(self) -> Iterator[None]:
-        """Within it, Ctrl-C ends the loop after the present step; pressed again, at once."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def stop(number: int, frame: Any) -> None:
-            self.stop("interrupted")
-            signal.signal(signal.SIGINT, previous)
-
-        previous = signal.signal(signal.SIGINT, stop)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, previous)
+    # ---------------------- Checkpoints ----------------------
 
     def save(self, file: Path | str) -> None:
         """Write a checkpoint, from which `load` goes on. OSError : it cannot be written; the last one stays."""

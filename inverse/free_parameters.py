@@ -260,6 +260,10 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
                 found.append(Vertices(_body(key), entry, key, _copy(params[key]), faces))
             else:
                 found.append(Values(key, entry, key, _copy(params[key])))
+    for parameter in found:
+        masks = [parameter.mask(name) for name in parameter.start]
+        if not any(mask is None or mask.any() for mask in masks):
+            raise InputError(f'fit: "{parameter.name}" cannot move: move, turn or vertices leave nothing free')
     return found
 
 

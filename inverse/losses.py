@@ -24,6 +24,7 @@ from skimage.transform import pyramid_reduce
 from rimlight.loading import InputError
 
 from .classifier import Classifier
+from .conforming import conform
 
 #: In the denominator of `relative`, squared radiance.
 FLOOR = 0.01
@@ -171,6 +172,9 @@ class Loss:
     """Name of the channel of `aov_edge` that is compared, such as a depth map or a mask. The target holds its numbers
     as they are. Default: none, for integrators that render nothing but light."""
 
+    def __post_init__(self) -> None:
+        conform(self)
+
 
 def function(loss: Loss, norm: Norm | None = None) -> LossFunction:
     """The loss that settings describe. norm : in place of that of the settings, for a stage that has its own.
@@ -246,6 +250,9 @@ def drjit_loss(function: Callable[[Any, Any, Any], Any], label: str = "") -> Los
         seen, *others = (mi.TensorXf(np.ascontiguousarray(a, np.float32)) for a in (image, target, weight))
         dr.enable_grad(seen)
         value, metrics = value_and_metrics(function(seen, *others))
+        if not dr.is_diff_v(value) or dr.width(value) != 1 or not dr.grad_enabled(value):
+            got = f"{dr.width(value)} of {type(value).__name__}"
+            raise InputError(f"a loss must return one number of Dr.Jit that depends on the image, got {got}")
         dr.backward(value)
         return float(np.array(dr.detach(value)).item()), np.array(dr.grad(seen)).reshape(image.shape), metrics
 

@@ -185,9 +185,19 @@ class OfPair:
 
     def step(self, gradients: Mapping[str, mi.Float], rates: Mapping[str, float]) -> None:
         before = self._numbers()
-        changes, self.tree = self.pair.update({name: np.array(g) for name, g in gradients.items()}, self.tree, before)
-        for name, latent in before.items():
-            self.put(name, latent + rates[name] * np.asarray(changes[name]))
+        found = self.pair.update({name: np.array(g) for name, g in gradients.items()}, self.tree, before)
+        try:
+            changes, self.tree = found
+            after = {name: x + rates[name] * np.asarray(changes[name], np.float32) for name, x in before.items()}
+            if any(after[name].shape != x.shape for name, x in before.items()):
+                raise ValueError
+        except (TypeError, ValueError, KeyError):
+            sizes = ", ".join(f"{name}: {x.size}" for name, x in before.items())
+            raise InputError(
+                f"fit: update of the optimiser must return changes of these numbers, {sizes}, and its state"
+            ) from None
+        for name, latent in after.items():
+            self.put(name, latent)
 
     def state(self) -> dict[str, np.ndarray]:
         return {f"tree/{i}": np.array(leaf) for i, leaf in enumerate(_leaves(self.tree))}
@@ -207,7 +217,10 @@ def _rule(problem: Problem, owner: Mapping[str, Parameter]) -> OfMitsuba | OfPai
         # Large steps want one rate for all numbers of a mesh.
         made = {uniform: _by_name(problem, uniform) for uniform in (False, True)}
         return OfMitsuba({name: made[bool(p.free.smoothing)] for name, p in owner.items()}, start)
-    made = rule if isinstance(rule, mi.ad.Optimizer) or not callable(rule) else rule(1.0)
+    try:
+        made = rule if isinstance(rule, mi.ad.Optimizer) or not callable(rule) else rule(1.0)
+    except TypeError as error:
+        raise InputError(f"fit: optimiser(1.0), for the learning rate 1, makes no optimiser: {error}") from None
     if not isinstance(made, mi.ad.Optimizer):
         raise InputError(
             'fit: optimiser must be "adam", "sgd", an optimiser of Mitsuba or a function that makes one, or have the '

@@ -1,4 +1,8 @@
-"""Pages that need nothing but themselves: one HTML file with style, script and pictures inside; all text is escaped."""
+"""Pages that need nothing but themselves: one HTML file with style, script and pictures inside; all text is escaped.
+
+Functions make pieces of HTML of numbers and pictures, and others put them together. A template would hold only what is
+around them: a head, and a few headings.
+"""
 
 from __future__ import annotations
 

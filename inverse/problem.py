@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import cattrs
+import numpy as np
 import tomli_w
 from cattrs.gen import make_dict_structure_fn
 from cattrs.strategies import configure_union_passthrough
@@ -18,7 +19,8 @@ from cattrs.strategies import configure_union_passthrough
 from rimlight.exr import replacing
 from rimlight.loading import InputError
 
-from . import losses
+from . import checks, losses
+from .conforming import conform, of_kind, one_of
 from .losses import Loss, Norm
 
 if sys.version_info >= (3, 11):
@@ -27,6 +29,7 @@ else:
     import tomli as tomllib
 
 Kind = Literal["pose", "material", "light", "shape"]
+Colour = Literal["auto", "linear", "srgb"]
 Value = str | bool | int | float
 
 # What files and the command line can say is less than what Python can.
@@ -58,7 +61,7 @@ class Target:
     """Scene that the picture shows. Default: the scene of the problem."""
     sensor: int = 0
     """Number of the sensor that took the picture."""
-    colour: Literal["auto", "linear", "srgb"] = "auto"
+    colour: Colour = "auto"
     """How its numbers relate to radiance. auto: EXR is linear, PNG and JPEG are sRGB."""
     alpha: bool = False
     """Weigh pixels by the alpha channel of the picture."""
@@ -70,6 +73,8 @@ class Target:
     """Samples per pixel of a target that is rendered."""
 
     def __post_init__(self) -> None:
+        conform(self)
+        one_of(self, "colour", get_args(Colour))
         for name in ("file", "scene", "mask"):
             object.__setattr__(self, name, _place(getattr(self, name)))
 
@@ -109,6 +114,8 @@ class Free:
     def __post_init__(self) -> None:
         if isinstance(self.key, str):
             object.__setattr__(self, "key", (self.key,))
+        conform(self)
+        one_of(self, "kind", get_args(Kind))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,9 +136,19 @@ class Stage:
     norm: Norm | None = None
     """Norm of the loss in this stage. Default: that of the loss of the problem."""
 
+    def __post_init__(self) -> None:
+        conform(self)
+
     def factor(self, iteration: int) -> float:
-        """Factor of all rates in a step of the stage."""
-        first = self.rate(iteration) if callable(self.rate) else self.rate
+        """Factor of all rates in a step of the stage. InputError : a schedule says nonsense."""
+        first: Any = self.rate
+        if callable(first):
+            first = np.asarray(first(iteration))  # those of other libraries return arrays without dimensions
+            if first.shape or first.dtype.kind not in "fiu" or not 0 <= first < np.inf:
+                said = " ".join(repr(first.tolist()).split())
+                raise InputError(
+                    f"fit: the schedule of a stage must return a number >= 0, got {said} at step {iteration}"
+                )
         return float(first * self.decay ** (iteration / max(self.iterations - 1, 1)))
 
 
@@ -147,6 +164,9 @@ class Starts:
     """Standard deviation of the rotation vectors of rigid bodies, in degrees."""
     value: float = 0
     """Standard deviation of other parameters, in their own units."""
+
+    def __post_init__(self) -> None:
+        conform(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,14 +228,17 @@ class Problem:
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
         put("scene", _place(self.scene))
-        if callable(self.loss) and not isinstance(self.loss, Loss):
+        conform(self)
+        if isinstance(self.loss, str) or (callable(self.loss) and not isinstance(self.loss, Loss)):
             put("loss", Loss(norm=self.loss))
         for name in ("free", "stage", "target"):
             entries = getattr(self, name)
             put(name, tuple(entries) if isinstance(entries, tuple | list) else (entries,))
         targets = (t if isinstance(t, Target) else Target(file=t, sensor=i) for i, t in enumerate(self.target))
         put("target", tuple(targets))
-        check(self)
+        for name, kind in {"free": Free, "stage": Stage, "starts": Starts, "loss": Loss, "integrator": dict}.items():
+            of_kind(name, getattr(self, name), kind)
+        checks.check(self)
 
     @property
     def norms(self) -> tuple[Norm, ...]:
@@ -226,77 +249,6 @@ class Problem:
     def compares(self) -> bool:
         """Are pictures compared with their targets?"""
         return all(map(losses.compares, self.norms))
-
-
-# ------------------------------------------------------------------ checks
-
-
-def check(problem: Problem) -> None:
-    """Refuse what cannot be meant.
-
-    Raises
-    ------
-    InputError : a number is out of range, or something is missing. The text names it as the TOML file does.
-    """
-    if not problem.free:
-        raise InputError("fit: nothing is free, add a table [[free]]")
-    if not problem.target or not problem.stage:
-        raise InputError("fit: a fit needs at least one target and one stage")
-    if problem.views_per_step is not None and problem.views_per_step > len(problem.target):
-        raise InputError(
-            f"fit: views_per_step is {problem.views_per_step}, but there are only {len(problem.target)} targets"
-        )
-    at_least = {"parts": 1, "views_per_step": 1, "seed": 0, "threads": 1, "max_bad": 1, "patience": 1, "seconds": 0}
-    _at_least("", problem, at_least)
-    _positive("", problem, ("clip", "max_memory"))
-    for name in ("momentum", "smooth_scale"):
-        if not 0 <= getattr(problem, name) < 1:
-            raise InputError(f"fit: {name} must be in [0, 1), got {getattr(problem, name)}")
-    if "type" not in problem.integrator:
-        raise InputError('fit: integrator needs a "type"')
-    _at_least("loss.", problem.loss, {"pyramid": 0, "exclude_above": 0})
-    _at_least("starts.", problem.starts, {"count": 1, "move": 0, "turn": 0, "value": 0})
-    if problem.starts.count > 1 and not (problem.starts.move or problem.starts.turn or problem.starts.value):
-        raise InputError(
-            "fit: several starts need starts.move, starts.turn or starts.value, else they are all the same"
-        )
-    for i, stage in enumerate(problem.stage):
-        _at_least(f"stage.{i}.", stage, {"iterations": 1, "resolution": 1, "spp": 1})
-        _positive(f"stage.{i}.", stage, ("decay",) if callable(stage.rate) else ("rate", "decay"))
-    for i, target in enumerate(problem.target):
-        _at_least(f"target.{i}.", target, {"sensor": 0, "spp": 1})
-    pictures = ((f"target.{i}.{n}", getattr(t, n)) for i, t in enumerate(problem.target) for n in ("file", "mask"))
-    losses.check(problem.loss, problem.norms, [name for name, picture in pictures if picture is not None])
-    for i, free in enumerate(problem.free):
-        where = f"free.{i}."
-        if not free.key:
-            raise InputError(f"fit: {where}key is empty")
-        _positive(where, free, ("rate", "turn_rate"))
-        _at_least(where, free, {"smoothing": 0})
-        for name in ("move", "turn"):
-            axes = getattr(free, name)
-            if set(axes) - set("xyz") or len(set(axes)) < len(axes):
-                raise InputError(f'fit: {where}{name} must consist of the letters x, y, z, got "{axes}"')
-        low, high = (
-            default if bound is None else bound
-            for bound, default in ((free.lower, float("-inf")), (free.upper, float("inf")))
-        )
-        if not low < high:  # nor if one is not a number
-            raise InputError(f"fit: {where}lower must be below upper, got {low} and {high}")
-
-
-def _at_least(where: str, of: Any, minima: Mapping[str, float]) -> None:
-    for name, minimum in minima.items():
-        value = getattr(of, name)
-        if value is not None and not value >= minimum:
-            raise InputError(f"fit: {where}{name} must be >= {minimum}, got {value}")
-
-
-def _positive(where: str, of: Any, names: tuple[str, ...]) -> None:
-    for name in names:
-        value = getattr(of, name)
-        if value is not None and not 0 < value < float("inf"):
-            raise InputError(f"fit: {where}{name} must be > 0, got {value}")
 
 
 # ------------------------------------------------------------------ files

@@ -6,12 +6,14 @@ fitted. It returns one number of Dr.Jit. Give them to `Fit(â€¦, regularisers=[â€
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from rimlight.edge_sampling.refusals import InputError
 
 #: Scene parameters, key -> value, attached -> one number.
 Regulariser = Callable[[Mapping[str, Any]], Any]
@@ -70,3 +72,17 @@ def prior(key: str, mean: Any, spread: float, strength: float = 1.0) -> Regulari
         return strength * dr.mean(dr.square((flat - mi.Float(expected)) / spread))
 
     return penalty
+
+
+def penalty_of(regularisers: Sequence[Regulariser], attached: Mapping[str, Any]) -> Any:
+    """Their sum, attached to the values, or None if there are none. InputError : one cannot say it."""
+    if not regularisers:
+        return None
+    try:
+        parts = [regularise(attached) for regularise in regularisers]
+    except KeyError as error:
+        free = ", ".join(attached)
+        raise InputError(f"fit: a regulariser asks for {error}, which is not free; free are {free}") from None
+    if strange := [type(part).__name__ for part in parts if not dr.is_diff_v(part)]:
+        raise InputError(f"fit: a regulariser must return a number of Dr.Jit, which has a derivative, got {strange[0]}")
+    return sum((dr.sum(part.array if dr.is_tensor_v(part) else part) for part in parts), mi.Float(0))

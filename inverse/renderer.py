@@ -11,14 +11,16 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.loading import load_integrator, use_variant
+from rimlight.loading import InputError, load_integrator, use_variant
 
 from . import losses, sources
+from .free_parameters import to_numpy
 from .loaded_scene import LoadedScene
 from .problem import Problem
 from .view import View, derived_seed
@@ -125,9 +127,18 @@ class Renderer:
         self.scenes = {key: sources.scene(s, problem.define) for key, s in {sources.key(s): s for s in used}.items()}
         loaded = {key: LoadedScene(scene, load_integrator(kind, **options)) for key, scene in self.scenes.items()}
         self.views = [View(problem, i, loaded[k], self.losses) for i, k in enumerate(map(sources.key, used))]
-        self.params = {}
+        self.params: dict[str, Any] = {}
         for scene in loaded.values():
+            self._check_alike(scene.params)
             self.params = dict(scene.params.items()) | self.params
+
+    def _check_alike(self, params: mi.SceneParameters) -> None:
+        """InputError : a free parameter is of another type or size in a scene than in those before."""
+        for key in (key for free in self.problem.free for key in free.key if key in params and key in self.params):
+            here, before = params[key], self.params[key]
+            if type(here) is not type(before) or np.shape(to_numpy(here)) != np.shape(to_numpy(before)):
+                said = " and ".join(f"{type(x).__name__} {np.shape(to_numpy(x))}" for x in (before, here))
+                raise InputError(f'fit: "{key}" is not alike in all scenes, but {said}')
 
     # ---------------------- What executors call ----------------------
 

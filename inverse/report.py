@@ -140,7 +140,7 @@ def _verdict(result: Result) -> str:
     planned = sum(stage.iterations for stage in stages) + (result.problem.starts.count - 1) * stages[0].iterations
     finished = result.status == "finished"
     steps = f"{len(result.losses)} steps" if finished else f"{len(result.losses)} of {planned} steps"
-    facts = [f"{steps} in {result.seconds:.3g} s"]
+    facts = [f"{steps} in {_duration(result.seconds)}"]
     if len(result.losses):
         first, last = _loss_before_and_after(result)
         facts.append(f"loss {number(first)} → {number(last)}")
@@ -158,6 +158,10 @@ def _verdict(result: Result) -> str:
         items = "\n".join(f"<li>{html.escape(text)}</li>" for text in found)
         line += f'\n<ul class="warnings" aria-label="Warnings">\n{items}\n</ul>'
     return line
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds < 600 else f"{seconds / 60:.0f} min"
 
 
 def _warnings(result: Result) -> list[str]:

@@ -52,7 +52,8 @@ def numbers(source: Any) -> np.ndarray:
         source = source.detach().cpu()
     array = np.asarray(source)
     if array.dtype.kind not in "fiub":
-        raise InputError(f"fit: a picture is a path, an array or a tensor, got {type(source).__name__}")
+        what = f"an array of {array.dtype}" if array.ndim else type(source).__name__
+        raise InputError(f"fit: a picture is a path, an array or a tensor, got {what}")
     return array
 
 
@@ -107,6 +108,8 @@ def _of_scene(scene: mi.Scene) -> str:
 
 
 def _of_file(path: Path) -> str:
+    if not path.is_file():
+        raise FileNotFoundError(f'fit: there is no file "{path}"')
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 

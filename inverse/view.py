@@ -151,9 +151,12 @@ class View:
             raise InputError(f"fit: target.{self.number}: {error}") from None
         try:
             value, gradient, metrics = found
-            value, shape, metrics = float(value), np.shape(gradient), dict(metrics)
-        except (TypeError, ValueError):
-            raise InputError(f"{who} must return a number, its gradient, and a dictionary of metrics") from None
+            value, shape = float(value), np.shape(gradient)
+            metrics = {label: float(number) for label, number in metrics.items()}
+        except (TypeError, ValueError, AttributeError):
+            raise InputError(
+                f"{who} must return a number, its gradient, and a dictionary of metrics, numbers by name"
+            ) from None
         if shape != target.shape:
             raise InputError(f"{who} has a gradient of shape {shape} for a picture of shape {target.shape}")
 
@@ -161,7 +164,8 @@ class View:
         """What may make no sense about the target, seen beside a first render, for people; or nothing."""
         if not (self.problem.compares and self.shows_light):
             return ""
-        found = targets.doubts(image, *self.target_at(image.shape[:2]))
+        whole = targets.whole_numbers(self.picture()[0])
+        found = targets.doubts(image, *self.target_at(image.shape[:2]), whole)
         return f"Target {self.number} " + "; it ".join(found) + "." if found else ""
 
     # ---------------------- Film ----------------------
@@ -238,7 +242,7 @@ class View:
         if most < 1:
             raise InputError(
                 f"fit: max_memory is {self.problem.max_memory:g} MB, but one sample per pixel of target "
-                f"{self.number} at {size[0]} x {size[1]} needs {before + each:.0f} MB; use a smaller resolution"
+                f"{self.number} at {size[0]} x {size[1]} needs {before + each:.3g} MB; use a smaller resolution"
             )
         return next(n for n in range(1, spp + 1) if spp % n == 0 and spp // n <= most)
 

@@ -26,6 +26,8 @@ import rimlight
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.loading import one_line
 
+from . import interruption
+
 log = logging.getLogger(__name__)
 
 #: Seconds between two looks at who is there, while work is being done.
@@ -34,14 +36,23 @@ POLL = 1.0
 #: Seconds without a sign of life after which a worker counts as lost. Busy ones give signs, too.
 SILENT = 60.0
 
+#: Seconds in which a scheduler must answer. One that is frozen, on a machine that is not, never does.
+ANSWER = 60.0
+
 #: Seconds to wait for the first worker, or for a new one after all were lost.
 PATIENCE = 120.0
+
+#: Seconds for which Dask tries to reach a scheduler, at first, and again when the connection broke.
+CONNECT = 20.0
 
 #: How often work is given out whose workers were lost.
 TRIES = 5
 
 #: Seconds that others are given after a worker was lost, who may wait for what it held.
 GRACE = 30.0
+
+#: What to do when the scheduler is lost.
+AGAIN = "start a cluster, and resume"
 
 #: Parts that are added up by one task.
 FAN = 8
@@ -98,27 +109,35 @@ class Workers:
         if isinstance(cluster, int) and cluster < 1:
             raise InputError(f"the number of workers must be >= 1, got {cluster}")
         self.threads = threads
+        self._address = "an unknown place"
         self._last: tuple[float, list[Worker]] | None = None  # when was looked for workers, and who was there
         self._kept: tuple[list[str], Any, Any] | None = None  # workers that hold a thing, and their future
         self._mine: list[Any] = []
         if isinstance(cluster, int):
             cluster = LocalCluster(
-                n_workers=cluster, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
+                n_workers=cluster,
+                threads_per_worker=1,
+                dashboard_address=":0",
+                silence_logs=logging.CRITICAL,
+                preload=[interruption.__name__],
             )
             self._mine.append(cluster)
         try:
             if isinstance(cluster, Client):
                 self.client = cluster
             else:
-                self.client = Client(cluster, timeout=20, set_as_default=False)
+                self.client = Client(cluster, timeout=CONNECT, set_as_default=False)
                 self._mine.insert(0, self.client)
         except (OSError, ValueError) as error:
             raise InputError(f'no cluster at "{cluster}": {error}') from None
+        if self.client.scheduler is not None:
+            self._address = self.client.scheduler.address
 
     def close(self) -> None:
         """Close what was opened here. What was given stays as it was."""
         for opened in self._mine:
-            opened.close()
+            with suppress(asyncio.TimeoutError):  # of a scheduler that is frozen
+                opened.close()
 
     def __enter__(self) -> Workers:
         return self
@@ -165,8 +184,7 @@ class Workers:
             except (OSError, CancelledError, self._killed()) as error:
                 why = one_line(error)
             self._last = self._kept = None
-            with suppress(OSError, CancelledError):
-                self.client.cancel(given, force=True)
+            self._cancel(given)
             log.warning("%s; the step is done again", why)
         raise Lost(f"workers were lost {TRIES} times in a row, the last time: {why}; have they enough memory?")
 
@@ -197,7 +215,7 @@ class Workers:
                 return sorted(done, key=lambda block: block.numbers)
             log.warning("a worker was lost; its part of the step is done again")
             self._last = self._kept = None
-            self.client.cancel([block.future for block in lost], force=True)
+            self._cancel([block.future for block in lost])
             done = [block for block in done if block not in lost]
             again = sorted(i for block in lost for i in block.numbers)
             places = {i: k / len(again) for k, i in enumerate(again)}
@@ -206,6 +224,13 @@ class Workers:
     def _submit(self, given: list[Any], where: Sequence[str], task: Callable, *arguments: Any) -> Any:
         given.append(self.client.submit(task, *arguments, pure=False, workers=where))
         return given[-1]
+
+    def _cancel(self, futures: Sequence[Any]) -> None:
+        """If the scheduler can be reached."""
+        with suppress(OSError, CancelledError, asyncio.TimeoutError):
+            self.client.sync(
+                lambda: self.client.cancel(futures, asynchronous=True, force=True), callback_timeout=10 * POLL
+            )
 
     def _wait_for(self, blocks: Sequence[Block], again: bool) -> list[Block]:
         """Wait until all are done, or some are lost: these. again : was one lost before? Then others may wait for what
@@ -220,7 +245,7 @@ class Workers:
             addresses = {worker.address for worker in self.present()}
             lost = {block.address for block in blocks} - addresses
             keys = [block.future.key for block in blocks]
-            waiting = self.client.run_on_scheduler(_waiting, keys=keys) if lost else []
+            waiting = self._ask(_waiting, keys=keys) if lost else []
             late = again and time.monotonic() - began > GRACE
             if lost or late:
                 return [
@@ -265,18 +290,24 @@ class Workers:
 
     def present(self) -> list[Worker]:
         """Workers that have given a sign of life. Lost : the scheduler is gone."""
-        if self.client.status != "running":
-            raise Lost(f"the scheduler at {self._address()} is gone; start a cluster, and resume")
-        try:
-            found = self.client.run_on_scheduler(_list_workers)
-        except (OSError, CancelledError, asyncio.TimeoutError) as error:
-            raise Lost(
-                f"the scheduler at {self._address()} is gone: {one_line(error)}; start a cluster, and resume"
-            ) from None
-        return [worker for worker in found if worker.silent < SILENT]
+        return [worker for worker in self._ask(_list_workers) if worker.silent < SILENT]
 
-    def _address(self) -> str:
-        return self.client.scheduler.address if self.client.scheduler is not None else "an unknown place"
+    def _ask(self, function: Callable[..., Any], **arguments: Any) -> Any:
+        """What a function says that is called on the scheduler, also if the connection breaks for a moment.
+
+        Raises
+        ------
+        Lost : the scheduler is gone, or frozen.
+        """
+        while self.client.status in ("running", "connecting"):
+            if self.client.status == "running":
+                began = time.monotonic()
+                with suppress(OSError, CancelledError, asyncio.TimeoutError):
+                    return self.client.run_on_scheduler(function, callback_timeout=ANSWER, **arguments)
+                if time.monotonic() - began >= ANSWER:
+                    raise Lost(f"the scheduler at {self._address} has not answered for {ANSWER:.0f} s; {AGAIN}")
+            time.sleep(POLL / 4)  # Dask connects again, or gives up
+        raise Lost(f"the scheduler at {self._address} is gone; {AGAIN}")
 
     def _wait_for_workers(self) -> list[Worker]:
         began = time.monotonic()

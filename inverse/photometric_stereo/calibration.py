@@ -54,6 +54,7 @@ class Ball:
         """
         edges, pixels = _outline(mask), np.argwhere(mask)[:, ::-1]
         if camera is None:
+            # As scikit-image's CircleModel, whose names changed in 0.26:
             # (u - a)^2 + (v - b)^2 = R^2 is linear in a, b and R^2 - a^2 - b^2 (Kasa 1976)
             design = np.c_[2 * edges, np.ones(len(edges))]
             *centre, rest = np.linalg.lstsq(design, (edges**2).sum(1), rcond=None)[0]

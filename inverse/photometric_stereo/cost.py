@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+
+import drjit as dr
+import psutil
 
 from .direct import SAMPLED
 from .reconstruction import Options
@@ -16,6 +18,16 @@ FIXED, READING, OF_VALUE, OF_PIXEL, NEAR = 7e8, 28, 47, 1500, 20
 #: Measured.
 OF_ALL, OF_VALUES, OF_BSDF = 0.5, 5e-6, 1.2e-4
 
+#: Of control groups, version 2 and 1: files of their limit, of what is used, and of the part of that which the system
+#: takes back when it needs it. psutil looks at the machine alone.
+GROUPS = tuple(
+    tuple(f"/sys/fs/cgroup/{name}" for name in names)
+    for names in (
+        ("memory.max", "memory.current", "memory.stat"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat"),
+    )
+)
+
 
 def memory(pixels: int, images: int, options: Options, *, near: bool = False) -> float:
     """Bytes, at most. near : have the lights positions?"""
@@ -24,8 +36,11 @@ def memory(pixels: int, images: int, options: Options, *, near: bool = False) ->
 
 
 def seconds(pixels: int, images: int, options: Options, cores: int | None = None) -> float:
-    """Without descent, if no alternation is spared. Right within a factor of about three. cores : default: all."""
-    cores = cores or os.cpu_count() or 1
+    """Without descent, if no alternation is spared. Right within a factor of about three.
+
+    cores : default: as many as Dr.Jit has threads.
+    """
+    cores = cores or dr.thread_count()
     counts = list(options.iterations)
     for level, others in zip((0, -1), options.others(), strict=True):
         counts[level] += others
@@ -36,11 +51,15 @@ def seconds(pixels: int, images: int, options: Options, cores: int | None = None
     return total
 
 
-def available_memory() -> int | None:
-    """Bytes, where the system tells it."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    return found[0] if found else None
+def available_memory() -> int:
+    """Bytes that this process may still take: of its machine, and of its control group, such as a container or a job of
+    SLURM, where that has a limit."""
+    free = psutil.virtual_memory().available
+    for limit, used, cached in GROUPS:
+        try:
+            given, taken = (int(Path(file).read_text(encoding="ascii")) for file in (limit, used))
+            facts = dict(line.split() for line in Path(cached).read_text(encoding="ascii").splitlines())
+        except (OSError, ValueError):  # there is no such group, or its limit is "max"
+            continue
+        free = min(free, given - taken + int(facts.get("inactive_file", 0)))
+    return free

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import logging
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -377,19 +378,17 @@ def _numbers(path: Path, columns: int) -> np.ndarray:
     if not path.is_file():
         raise FileNotFoundError(f'ps: there is no file "{path}"')
     try:
-        rows = [
-            [float(word) for word in line.partition("#")[0].split()]
-            for line in path.read_text(encoding="utf-8").splitlines()
-        ]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without numbers
+            rows = np.loadtxt(path, ndmin=2, encoding="utf-8")
     except ValueError as error:
-        raise InputError(f"ps: {path.name}: {error}") from None
-    rows = [row for row in rows if row]
+        raise InputError(f"ps: {path.name}: {str(error).partition(';')[0]}") from None
+    if not rows.size:
+        raise InputError(f"ps: {path.name} is empty")
     for k, row in enumerate(rows, 1):
         if len(row) != columns or not np.isfinite(row).all():
-            raise InputError(f"ps: {path.name}, row {k}: expected finite numbers, {columns} of them, got {row}")
-    if not rows:
-        raise InputError(f"ps: {path.name} is empty")
-    return np.array(rows)
+            raise InputError(f"ps: {path.name}, row {k}: expected {columns} finite numbers, got {row.tolist()}")
+    return rows
 
 
 def _truth(folder: Path, mask: np.ndarray) -> np.ndarray | None:

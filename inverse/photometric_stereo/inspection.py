@@ -162,7 +162,7 @@ def warnings(found: Inspection) -> list[str]:
             f"There is no light in {found.gap:.0f} degrees around the camera's axis: sides that face there stay in "
             "shadow, and their normals are uncertain."
         )
-    if (there := cost.available_memory()) is not None and found.memory > there:
+    if found.memory > (there := cost.available_memory()):
         said.append(
             f"A reconstruction would take {found.memory / 2**30:.1f} GiB of memory, of which {there / 2**30:.1f} GiB "
             "are available, and will be refused: use fewer --images, or --resolutions 0.25 0.5 with --iterations 10 6."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -11,13 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from tyro.conf import Positional, arg
 
 from rimlight import inverse
 from rimlight.inverse import Free, Problem
 from rimlight.loading import InputError, expected
 
-from ._loading import at_least, check_output
+from ._loading import at_least, check_output, show_warnings
+
+#: Of more views than so, their mean is printed; the report has all.
+FEW_VIEWS = 4
 
 #: What is shown by --help before there is a file.
 EXAMPLE = Problem(scene=Path("scene.xml"), free=(Free(key=("shape.vertex_positions",), kind="pose"),))
@@ -57,7 +60,7 @@ class Fit:
                 kinds = ", ".join(sorted({f.kind for f in problem.free}))
                 raise InputError(f'nothing of the kind "{self.kind}" is free in "{self.config}", only {kinds}')
             problem = dataclasses.replace(problem, free=free)
-        _show_warnings()
+        show_warnings()
         with ExitStack() as stack, expected(OSError):
             executor = None
             if self.cluster is not None or self.workers:
@@ -75,22 +78,21 @@ class Fit:
         return {"finished": 0, "out of time": 0, "interrupted": 130}.get(found.status, 1)
 
 
-def _show_warnings() -> None:
-    """Of Rimlight; what Dask says of its workers' lives and deaths is said again in a line of ours."""
-    handler = logging.StreamHandler()
-    handler.addFilter(lambda record: not record.name.startswith("distributed"))
-    logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s", handlers=[handler])
-
-
 def _print(found: inverse.Result) -> None:
     print(f"{found.status}: {len(found.losses)} steps in {found.seconds:.1f} s")
     for label, errors in found.errors.items():
         print(f"  {label}: {errors[0]:.4g} -> {errors[-1]:.4g}")
-    for i, measures in enumerate(found.measures):
-        for label, (before, after) in measures.items():
-            print(f"  view {i}, {label}: {before:.4g} -> {after:.4g}")
+    count = len(found.measures)
+    of_views = (
+        {f"view {i}": [i] for i in range(count)} if count <= FEW_VIEWS else {f"mean of {count} views": range(count)}
+    )
+    for name, views in of_views.items():
+        for label in found.measures[0]:
+            before, after = np.mean([found.measures[i][label] for i in views], axis=0)
+            print(f"  {name}, {label}: {before:.4g} -> {after:.4g}")
         if found.floors:
-            print(f"  view {i}, root mean square error at the truth (noise): {found.floors[i]:.4g}")
+            noise = np.mean([found.floors[i] for i in views])
+            print(f"  {name}, root mean square error at the truth (noise): {noise:.4g}")
     if found.skipped:
         print(f"  {found.skipped} steps were left out: a number would not have been finite")
     for name in found.silent:
@@ -145,7 +147,7 @@ class Reproduce:
         at_least(1, seeds=self.seeds)
         at_least(0, workers=self.workers)
         check_output(self.out, folder=True)
-        _show_warnings()
+        show_warnings()
         with ExitStack() as stack, expected(OSError):
             workers = None
             if self.cluster is not None or self.workers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -109,3 +110,10 @@ def make_folder(path: Path) -> Path:
     with expected(OSError, who="--out"):
         path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def show_warnings() -> None:
+    """Of Rimlight; what Dask says of its workers' lives and deaths is said again in a line of ours."""
+    handler = logging.StreamHandler()
+    handler.addFilter(lambda record: not record.name.startswith("distributed"))
+    logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s", handlers=[handler])

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-import signal
+import dataclasses
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,7 +15,10 @@ import drjit as dr
 import numpy as np
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
+from rimlight import inverse
+from rimlight.edge_sampling.refusals import Refusal
 from rimlight.exr import read_exr, remove_left_over
+from rimlight.inverse.interruption import listening
 from rimlight.inverse.photometric_stereo import (
     calibration,
     cost,
@@ -30,7 +32,7 @@ from rimlight.inverse.photometric_stereo import (
 )
 from rimlight.loading import InputError, expected, use_variant
 
-from ._loading import at_least, check_output
+from ._loading import at_least, check_output, show_warnings
 
 #: Of a run that has not finished.
 CHECKPOINT = "checkpoint.npz"
@@ -38,12 +40,12 @@ CHECKPOINT = "checkpoint.npz"
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Reconstruct normals, depth and reflectance of a data set."""
+    """Reconstruct normals, depth and reflectance of a data set, or of several."""
 
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """Folder with images, lights and a mask, in the layout of DiLiGenT."""
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER [FOLDER ...]")]
+    """Folders with images, lights and a mask, in the layout of DiLiGenT."""
     out: Path
-    """Folder for the results and the checkpoint."""
+    """Folder for the results and the checkpoint. Of several data sets, each has a folder of its name in it."""
     resume: bool = False
     """Continue from the checkpoint in that folder."""
     images: int = 0
@@ -52,22 +54,73 @@ class Run:
     """Variant of Mitsuba."""
     threads: int = 0
     """Threads of Dr.Jit. 0: one for each core. With 1, repeated runs have the same result, bit by bit."""
+    workers: int = 0
+    """Number of processes of this machine, each of which reconstructs one data set at a time. 0: this process
+    reconstructs all."""
+    cluster: str | None = None
+    """Address of the scheduler of a Dask cluster, such as tcp://10.0.0.1:8786, whose workers reconstruct."""
     options: Annotated[reconstruction.Options, arg(name="")] = field(default_factory=reconstruction.Options)
 
     def run(self) -> int:
-        at_least(0, images=self.images, threads=self.threads)
+        at_least(0, images=self.images, threads=self.threads, workers=self.workers)
+        if not self.folders:
+            raise InputError("name a folder with images, lights and a mask")
+        show_warnings()
+        elsewhere = self.cluster or self.workers
+        if len(self.folders) > 1 or elsewhere:
+            return self._several(elsewhere)
         check_output(self.out, folder=True)
+        code, lines = self.one()
+        for line in lines:
+            print(line)
+        return code
+
+    def _several(self, elsewhere: str | int) -> int:
+        """elsewhere : workers that reconstruct them."""
+        names = [folder.resolve().name for folder in self.folders]
+        if len(set(names)) < len(names):
+            raise InputError(f"data sets need different names, got {', '.join(names)}")
+        jobs = [
+            dataclasses.replace(self, folders=(folder.resolve(),), out=self.out.resolve() / name)
+            for folder, name in zip(self.folders, names, strict=True)
+        ]
+        for job in jobs:
+            check_output(job.out, folder=True)
+            if not self.resume:
+                job._done()
+        worst = 0
+        with ExitStack() as stack, expected(OSError):
+            if elsewhere:
+                workers = stack.enter_context(inverse.Workers(elsewhere, self.threads or None))
+                items = [(i / len(jobs), dataclasses.replace(job, threads=0)) for i, job in enumerate(jobs)]
+                blocks = workers.run(_attempts, None, None, items)
+                found = (outcome for _, of_block in blocks for outcome in of_block)
+            else:
+                found = (outcome for job in jobs for outcome in _attempts(None, None, [job]))
+            for name, (code, lines) in zip(names, found, strict=True):
+                print("\n".join(f"{name}: {line}" for line in lines), flush=True)
+                worst = max(worst, code)
+        return worst
+
+    @property
+    def folder(self) -> Path:
+        return self.folders[0]
+
+    def one(self) -> tuple[int, list[str]]:
+        """Exit code, and lines for people, of one data set."""
         if self._done():
-            return 0
+            return 0, [f"finished already: {self.out / 'report.html'}"]
         use_variant(self.variant)
         if self.threads:
             dr.set_thread_count(self.threads)
-        logging.basicConfig(level=logging.WARNING, format="rimlight: %(message)s")
         with expected(OSError, ValueError):
             self._check_memory()
             data, truth = dataset.read(self.folder, images=self.images), _true_depth(self.folder)
         with expected(OSError):
             return self._reconstruct(data, truth)
+
+    def has_begun(self) -> bool:
+        return (self.out / CHECKPOINT).exists() or (self.out / "metadata.json").exists()
 
     def _done(self) -> bool:
         """Is there nothing to resume, since the run has finished? Refuses a folder that holds something else."""
@@ -84,7 +137,6 @@ class Run:
             return False
         if output.status(self.out) != "finished":
             raise InputError(f'there is no checkpoint in "{self.out}" to resume from; leave out --resume')
-        print(f"finished already: {self.out / 'report.html'}")
         return True
 
     def _check_memory(self) -> None:
@@ -92,29 +144,30 @@ class Run:
         pixels, images = int(setup.mask.sum()), len(setup.names)
         near = setup.near or setup.away is not None
         needed = cost.memory(pixels, images, self.options, near=near)
-        if (there := cost.available_memory()) is not None and needed > there:
+        if needed > (there := cost.available_memory()):
             raise InputError(
                 f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
                 f"{there / 2**30:.1f} GiB are available; use fewer of the --images, or smaller --resolutions"
             )
 
-    def _reconstruct(self, data: dataset.Dataset, truth: np.ndarray | None) -> int:
+    def _reconstruct(self, data: dataset.Dataset, truth: np.ndarray | None) -> tuple[int, list[str]]:
         found: reconstruction.Result | None = None
+        pressed: list[bool] = []
 
         def after(result: reconstruction.Result) -> None:
             nonlocal found
             found = output.snapshot(result)
             output.write_numbers(self.out, found, self.options, status="running", truth=truth)
-            if stopped:
+            if pressed:
                 raise KeyboardInterrupt
 
         status = "finished"
         try:
-            with _listening() as stopped:
+            with listening(lambda: pressed.append(True)):
                 found = reconstruction.reconstruct(
                     data,
                     self.options,
-                    progress=sys.stderr.isatty(),
+                    progress=sys.stderr.isatty() and threading.current_thread() is threading.main_thread(),
                     after=after,
                     checkpoint=self.out / CHECKPOINT,
                     resume=self.resume,
@@ -130,13 +183,25 @@ class Run:
         report.write(self.out, found, self.options, title=title, status=status, truth=truth)
         if status == "finished":
             (self.out / CHECKPOINT).unlink(missing_ok=True)
-        print(f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s")
-        print(f"report: {self.out / 'report.html'}")
+        lines = [f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s"]
+        lines += [f"report: {self.out / 'report.html'}"]
         if (error := output.error_of_depth(found, truth)) is not None:
-            print(f"mean error of depth {error:.3g} {'pixels' if data.camera is None else ''}".rstrip())
+            lines += [f"mean error of depth {error:.3g} {'pixels' if data.camera is None else ''}".rstrip()]
         if found.error is not None:
-            print(f"mean angular error {found.error:.2f} deg")
-        return 0 if status == "finished" else 130
+            lines += [f"mean angular error {found.error:.2f} deg"]
+        return (0 if status == "finished" else 130), lines
+
+
+def _attempts(kept: None, shared: None, jobs: Sequence[Run]) -> list[tuple[int, list[str]]]:
+    """What `Run.one` says of several data sets. What has begun, maybe on a worker that was lost, goes on; an error of
+    one does not stop the others."""
+    found = []
+    for job in jobs:
+        try:
+            found.append(dataclasses.replace(job, resume=job.has_begun()).one())
+        except (InputError, Refusal) as error:
+            found.append((2, [str(error)]))
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,26 +286,6 @@ class Ps:
 
     def run(self) -> int:
         return self.command.run()
-
-
-@contextmanager
-def _listening() -> Iterator[list[bool]]:
-    """Within it, Ctrl-C only adds to the list that it gives, for the end of the alternation: in the midst of one, it
-    may leave Dr.Jit in the midst of a loop. Pressed again, it interrupts at once."""
-    pressed: list[bool] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield pressed
-        return
-
-    def press(*_) -> None:
-        pressed.append(True)
-        signal.signal(signal.SIGINT, previous)
-
-    previous = signal.signal(signal.SIGINT, press)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def _true_depth(folder: Path) -> np.ndarray | None:

@@ -1,7 +1,8 @@
 """Fits over workers: what travels, what it costs, what kills do, and what a model says of many workers.
 
     python tests/benchmarks/bm_workers.py travel
-    python tests/benchmarks/bm_workers.py kills
+    python tests/benchmarks/bm_workers.py kills        # of workers
+    python tests/benchmarks/bm_workers.py clients      # of the command
     python tests/benchmarks/bm_workers.py model
 
 Each takes a few minutes on two cores.
@@ -13,10 +14,12 @@ import asyncio
 import os
 import random
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +27,7 @@ import numpy as np
 from distributed import Client, LocalCluster
 
 from rimlight import inverse, scenes
-from rimlight.inverse import Cluster, Free, Problem, Stage, Target, executors
+from rimlight.inverse import Cluster, Free, Problem, Stage, Target, packing
 from rimlight.inverse.renderer import Renderer
 from rimlight.inverse.view import View
 
@@ -182,9 +185,9 @@ def travel() -> None:
 # ------------------------------------------------------------------ kills
 
 
-def kills(count: int = 20, seed: int = 0) -> None:
-    """Fits over two workers that lose one at a random moment; with one thread, results are equal bit by bit."""
-    problem = Problem(
+def small() -> Problem:
+    """A fit of some seconds. With one thread, results are equal bit by bit."""
+    return Problem(
         scene=scenes.path("two_triangles"),
         define={"res": "32"},
         target=tuple(Target(spp=64) for _ in range(6)),
@@ -196,6 +199,35 @@ def kills(count: int = 20, seed: int = 0) -> None:
         integrator={"type": "direct_edge"},
         threads=1,
     )
+
+
+def clients(count: int = 20, seed: int = 0) -> None:
+    """The command, with two workers, is killed at a random moment, and resumed on one."""
+    random.seed(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        inverse.problem.write(Path(folder) / "fit.toml", replace(small(), stage=Stage(iterations=400)))
+        command = [sys.executable, "-m", "rimlight", "fit", "joint", "fit.toml"]
+        start = lambda *options: subprocess.Popen([*command, *options], cwd=folder, stdout=subprocess.DEVNULL)
+        began = time.perf_counter()
+        start("--out", "whole", "--workers", "2").wait()
+        seconds, result = time.perf_counter() - began, lambda name: np.load(Path(folder) / name / "result.npz")
+        for i in range(1, count + 1):
+            killed, moment = start("--out", str(i), "--workers", "2"), random.uniform(0.1, 0.9) * seconds
+            with suppress(subprocess.TimeoutExpired):
+                killed.wait(moment)
+            killed.kill()
+            killed.wait()
+            begun = (Path(folder) / str(i) / "checkpoint.npz").exists()
+            resumed = start("--out", str(i), "--workers", "1", *["--resume"] * begun)
+            code, expected, found = resumed.wait(), result("whole"), result(str(i))
+            same = all(np.array_equal(expected[key], found[key]) for key in expected.files)
+            what = "resumed" if begun else "begun anew"
+            print(f"{i}: killed after {moment:.1f} of {seconds:.1f} s, {what}: {code}, {same}", flush=True)
+
+
+def kills(count: int = 20, seed: int = 0) -> None:
+    """Fits over two workers that lose one at a random moment."""
+    problem = small()
     random.seed(seed)
     expected: dict[str, np.ndarray] = {}
     for i in range(count + 1):
@@ -251,10 +283,10 @@ def costs(**options) -> Costs:
         began = time.perf_counter()
         client.gather([client.submit(pow, i, 2, pure=False) for i in range(200)])
         task = (time.perf_counter() - began) / 200
-    packed = executors.pack({"a": np.random.default_rng(0).standard_normal(one.size // 4)})
+    packed = packing.pack({"a": np.random.default_rng(0).standard_normal(one.size // 4)})
     began = time.perf_counter()
     for _ in range(5):
-        executors.pack({"a": executors.unpack(packed)["a"] + 1.0})
+        packing.pack({"a": packing.unpack(packed)["a"] + 1.0})
     return Costs(one.gradient / pieces, one.step - one.gradient, task, (time.perf_counter() - began) / 5, one.size)
 
 
@@ -306,4 +338,4 @@ def model() -> None:
 
 
 if __name__ == "__main__":
-    {"travel": travel, "kills": kills, "model": model}[sys.argv[1]]()
+    {"travel": travel, "kills": kills, "clients": clients, "model": model}[sys.argv[1]]()

@@ -283,7 +283,7 @@ def test_optimisers_that_are_none(optimiser, culprit):
 
 
 def test_schedules():
-    stages = Stage(iterations=3, rate=lambda i: 1 / (1 + i)), Stage(iterations=2, rate=0.5, decay=0.1)
+    stages = Stage(iterations=3, rate=lambda i: np.asarray(1 / (1 + i))), Stage(iterations=2, rate=0.5, decay=0.1)
     fit = inverse.Fit(posed(stage=stages))
     assert [step.rate for step in fit] == pytest.approx([1, 1 / 2, 1 / 3, 0.5, 0.05])
 

@@ -55,6 +55,10 @@ def written(path: Path, fit: Result, **options) -> Page:
 # ------------------------------------------------------------------ the page
 
 
+def test_durations_are_short():
+    assert [report._duration(s) for s in (0.01234, 59.96, 599, 2206.6)] == ["0.0123 s", "60 s", "599 s", "37 min"]
+
+
 def test_page_needs_nothing_but_itself(folder):
     source = (folder / "report.html").read_text("utf-8")
     for tag, attributes in Page(source).elements:

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import pickle
 import signal
-import socket
-import subprocess
-import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
+from machines import assert_same, fit_while, posed, run_fit, values_of, wait_for
 
-from rimlight import inverse, scenes
+from rimlight import inverse
 from rimlight.cli import main
-from rimlight.inverse import executors, fitting, workers
+from rimlight.inverse import executors, fitting, packing, workers
 from rimlight.inverse import problem as problems
-from rimlight.inverse.problem import Free, Problem, Stage, Target
+from rimlight.inverse.problem import Stage, Target
 from rimlight.inverse.renderer import Gradient
 from rimlight.pictures import write_image
 from rimlight.scenes import turntable
@@ -32,111 +27,6 @@ pytestmark = [
     pytest.mark.usefixtures("no_derivative_image"),
     pytest.mark.filterwarnings("default::ResourceWarning", "default::DeprecationWarning"),
 ]
-
-GREEN, COLOUR = "green.vertex_positions", "green.bsdf.reflectance.value"
-
-
-def posed(steps: int = 12, **options) -> Problem:
-    """Three views, of two scenes, in two parts each. With one thread, results are the same bit by bit."""
-    free = (
-        Free(key=(GREEN,), kind="shape", move="xy", rate=0.05, start=(0.2, -0.1, 0)),
-        Free(key=(COLOUR,), kind="material", rate=0.02, start=(0.2,)),
-    )
-    other = Target(scene=scenes.path("two_triangles"), spp=32)
-    options = {"target": (Target(spp=64), other, Target(spp=16)), "parts": 2, "threads": 1} | options
-    options = {"stage": (Stage(iterations=steps),), "integrator": {"type": "direct_edge"}} | options
-    return Problem(scene=scenes.path("two_triangles"), define={"res": "16"}, free=free, **options)
-
-
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory) -> dict[str, np.ndarray]:
-    """In a process of its own: what was loaded before in this one adds up in another order."""
-    folder = tmp_path_factory.mktemp("alone")
-    problems.write(folder / "fit.toml", posed())
-    process = run_fit(folder, "--out", "alone")
-    _, said = process.communicate(timeout=100)
-    assert process.returncode == 0, said
-    return values_of(folder / "alone")
-
-
-def run_fit(folder: Path, *options: str) -> subprocess.Popen:
-    """`rimlight fit joint fit.toml` in a process of its own, without the derivative image of the report."""
-    command = [sys.executable, "-m", "rimlight", "fit", "joint", "fit.toml", *options]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-
-
-def values_of(folder: Path) -> dict[str, np.ndarray]:
-    with np.load(folder / "result.npz") as found:
-        return dict(found)
-
-
-def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert found.keys() == expected.keys()
-    for key, value in expected.items():
-        np.testing.assert_array_equal(found[key], value, err_msg=key)
-
-
-class Machines:
-    """A scheduler and workers, each a process."""
-
-    def __init__(self, folder: Path):
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        self.folder, self.address = folder, f"tcp://127.0.0.1:{port}"
-        self.scheduler = self._start("dask_scheduler", "--host", "127.0.0.1", "--port", str(port))
-        self.workers: list[subprocess.Popen] = []
-
-    def add(self, threads: int = 1) -> subprocess.Popen:
-        name = f"w{len(self.workers)}"
-        options = ["--nthreads", str(threads), "--no-nanny", "--name", name, "--local-directory", str(self.folder)]
-        self.workers.append(self._start("dask_worker", self.address, *options))
-        return self.workers[-1]
-
-    def _start(self, module: str, *options: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", f"distributed.cli.{module}", *options, "--dashboard-address", ":0"]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-    def cluster(self, problem: Problem, count: int) -> executors.Cluster:
-        """When that many workers are there."""
-        cluster = executors.Cluster(problem, self.address)
-        wait_for(lambda: len(cluster.workers.present()) == count)
-        return cluster
-
-    def close(self) -> None:
-        for process in (*self.workers, self.scheduler):
-            if process.poll() is None:
-                process.send_signal(signal.SIGCONT)
-                process.kill()
-            process.wait()
-
-
-@pytest.fixture
-def machines(tmp_path) -> Iterator[Machines]:
-    made = Machines(tmp_path)
-    yield made
-    made.close()
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 60) -> None:
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-def fit_while(problem: Problem, cluster: executors.Cluster, step: int, happens: Callable[[], object], **options):
-    """A fit, and what happens in the middle of one of its steps."""
-    run = fitting.Fit(problem, executor=cluster, **options)
-
-    @run.on_step
-    def after(done: inverse.Step) -> None:
-        if done.number == step:
-            timer = threading.Timer(0.01, happens)
-            timer.start()
-
-    return run.run(progress=False)
-
 
 # ------------------------------------------------------------------ the same result
 
@@ -181,7 +71,8 @@ def test_a_fit_stops_when_no_worker_is_left(machines, monkeypatch, tmp_path, cap
     assert resumed.progress.step == len(found.losses)
 
 
-def test_a_fit_stops_when_the_scheduler_is_gone(machines, tmp_path):
+def test_a_fit_stops_when_the_scheduler_is_gone(machines, tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "CONNECT", 3.0)
     machines.add()
     with machines.cluster(posed(), 1) as cluster:
         found = fit_while(posed(), cluster, 3, machines.scheduler.kill, out=tmp_path / "out")
@@ -211,6 +102,22 @@ def test_a_client_that_was_killed_resumes_on_fewer_workers(alone, machines, tmp_
     assert_same(values_of(tmp_path / "killed"), values_of(tmp_path / "whole"))
 
 
+@pytest.mark.slow
+def test_an_interruption_of_the_terminal_reaches_the_fit_alone(tmp_path):
+    """Ctrl-C goes to all of its processes. Workers that died of it would be waited for."""
+    problems.write(tmp_path / "fit.toml", posed(stage=(Stage(iterations=4000),)))
+    process = run_fit(tmp_path, "--out", "out", "--workers", "2")
+    file = tmp_path / "out" / "checkpoint.npz"
+    wait_for(file.exists)
+    began = file.read_bytes()
+    wait_for(lambda: file.read_bytes() != began)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=100)
+    assert process.returncode == 130
+    (line,) = said.splitlines()
+    assert line == "rimlight: interrupted: the fit ends after this step, with a result; Ctrl-C ends it at once"
+
+
 # ------------------------------------------------------------------ who may work
 
 
@@ -231,6 +138,16 @@ def test_threads_of_the_same_process_are_refused():
         ):
             inverse.Fit(posed(), executor=cluster)
         assert client.status == "running"  # what was given is left as it was
+
+
+def test_a_cluster_works_for_its_own_problem():
+    """Once its workers compared the targets of the other one."""
+    with (
+        distributed.Client(processes=False, dashboard_address=":0", set_as_default=False) as client,
+        executors.Cluster(posed(steps=5), client) as cluster,
+        pytest.raises(ValueError, match="this cluster was made for another problem"),
+    ):
+        inverse.Fit(posed(), executor=cluster)
 
 
 @pytest.mark.parametrize(
@@ -265,11 +182,11 @@ def test_packing_loses_nothing():
     odd = np.resize(np.float64([0, 5e-324, -1e300, np.nan, np.inf, -0.1]), 2000)
     sparse = np.where(rng.random(normal.shape) < 0.3, normal, np.float32(0))
     arrays = {"normal": normal, "sparse": sparse, "zeros": 0 * normal, "odd": odd, "short": normal[0, 0]}
-    there = pickle.loads(pickle.dumps(executors.pack(arrays)))
-    for key, array in executors.unpack(there).items():
+    there = pickle.loads(pickle.dumps(packing.pack(arrays)))
+    for key, array in packing.unpack(there).items():
         np.testing.assert_array_equal(array, arrays[key])
         assert array.dtype == arrays[key].dtype and array.shape == arrays[key].shape
-    size = lambda key: len(pickle.dumps(executors.pack({key: arrays[key]}))) / arrays[key].nbytes
+    size = lambda key: len(pickle.dumps(packing.pack({key: arrays[key]}))) / arrays[key].nbytes
     assert size("normal") < 0.9 and size("sparse") < 0.32 and size("zeros") < 0.01
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import psutil
 import pytest
 from pages import Page, in_browser
 
@@ -214,6 +215,32 @@ def test_run_writes_everything(folder, result):
     np.testing.assert_allclose(reflected, [0.7, 0.5, 0.3], rtol=0.15)
     assert len(lobes) == len(weights)
     assert np.loadtxt(out / "exposures.txt") == pytest.approx(np.ones(LIGHTS))
+
+
+def test_several_data_sets_on_workers(folder, result, tmp_path, capfd):
+    """What is wrong with one does not stop the others, and is not done again."""
+    pytest.importorskip("distributed")
+    (tmp_path / "empty").mkdir()
+    one = ["--materials", "one", "--coat", "False"]
+    arguments = ["ps", "run", str(folder), str(tmp_path / "empty"), "--out", str(tmp_path / "out"), *QUICK, *one]
+    assert main([*arguments, "--brightness", "0", "--workers", "1"]) == 2
+    said = capfd.readouterr().out.splitlines()
+    assert said[0].startswith("bowl: finished: ") and said[-1].startswith("empty: ps: there is no file")
+    both = [json.loads((out / "metadata.json").read_text()) for out in (result[0], tmp_path / "out" / "bowl")]
+    assert both[0]["status"] == both[1]["status"] == "finished"
+    normals = [read_exr(out / "normals.exr")[0][""] for out in (result[0], tmp_path / "out" / "bowl")]
+    assert np.abs(normals[0] - normals[1]).mean() < 2e-3
+    assert main([*arguments, "--brightness", "0"]) == 2
+    assert "bowl" in (refused := capfd.readouterr().err) and "holds a result already" in refused
+    assert main([*arguments, "--brightness", "0", "--resume"]) == 2
+    assert capfd.readouterr().out.startswith("bowl: finished already: ")
+
+
+def test_data_sets_need_different_names(folder, tmp_path, capfd):
+    assert main(["ps", "run", str(folder), str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "data sets need different names, got bowl, bowl" in capfd.readouterr().err
+    assert main(["ps", "run", "--out", str(tmp_path / "out")]) == 2
+    assert "name a folder with images" in capfd.readouterr().err
 
 
 def test_page_shows_the_result(result):
@@ -431,13 +458,26 @@ def test_disk_that_fails(folder, tmp_path, capfd, monkeypatch):
     assert not list((tmp_path / "out").glob("*.exr"))
 
 
+def test_a_control_group_limits_memory(tmp_path, monkeypatch):
+    """What the system keeps of files counts as free; a group without a limit does not count."""
+    files = [tmp_path / name for name in ("max", "current", "stat")]
+    monkeypatch.setattr(cost, "GROUPS", (tuple(map(str, files)),))
+    machine = cost.available_memory()
+    assert 2**20 < machine <= psutil.virtual_memory().total
+    for file, text in zip(files, ("5000", "3000", "anon 2000\ninactive_file 700\n"), strict=True):
+        file.write_text(text)
+    assert cost.available_memory() == 5000 - 3000 + 700
+    files[0].write_text("max\n")
+    assert cost.available_memory() > 2**20
+
+
 def test_memory_is_checked(folder, tmp_path, capfd, monkeypatch):
     P, K, _ = dataset.read(folder).values.shape
     needed = cost.memory(P, K, reconstruction.Options())
     monkeypatch.setattr(cost, "available_memory", lambda: needed - 1)
     run = ["run", str(folder), "--out", str(tmp_path / "out")]
     refused(capfd, run, f"{K} images of {P} pixels", "GiB", "--images", "--resolutions")
-    monkeypatch.setattr(_ps.Run, "_reconstruct", lambda *_: 0)
+    monkeypatch.setattr(_ps.Run, "_reconstruct", lambda *_: (0, []))
     assert main(["ps", *run, "--images", str(K - 1)]) == 0
     assert main(["ps", *run, "--resolutions", "0.5", "--iterations", "1"]) == 0
 
