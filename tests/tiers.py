@@ -136,6 +136,8 @@ test_fit_gradients.py::test_replayed_gradients_are_the_same[prb]
 test_fit_gradients.py::test_replayed_gradients_are_the_same[prb_edge]
 test_fit_gradients.py::test_size_of_the_film_changes_and_comes_back
 test_fits.py::test_several_starts_find_what_one_does_not
+test_freezing.py::test_random_scenes[941650
+test_freezing.py::test_random_scenes[941656
 test_freezing.py::test_replay_sees_new_values[direct_edge-batch
 test_freezing.py::test_replay_sees_new_values[direct_edge-fisheye
 test_freezing.py::test_replay_sees_new_values[direct_edge-picture
