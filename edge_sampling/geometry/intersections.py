@@ -21,7 +21,7 @@ import numpy as np
 
 from .device_edges import rounding
 from .edges import EdgeKind, Edges, Weld
-from .meshes import Geometry, positions_of
+from .meshes import Geometry, number_of, positions_of
 from .rigid_motion import Shapes
 
 #: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
@@ -80,11 +80,10 @@ class Intersections:
         self._edges, self._place = edges, _index(weld.place)
         faces = geometry.faces((True,) * len(geometry.meshes))
         self._faces = [_index(faces[:, k]) for k in range(3)]
-        self._first_face = _first_faces(geometry)
-        #: The mesh of each face, on the device.
+        self._first_mesh = _first_meshes(geometry)
         counts = [m.face_count() for m in geometry.meshes]
+        self._first_face = _index(np.cumsum([0, *counts]))
         self._meshes = len(counts)
-        self._mesh_of_face = _index(np.repeat(np.arange(self._meshes), counts))
         self._walked: dict[tuple[int, ...], _Walked] = {}
         #: Where the meshes were (held, so that the number of an array is given to no other one).
         self._at: list[mi.Float] | None = None
@@ -191,15 +190,17 @@ class Intersections:
             ray.maxt = length - t
             pi = scene.ray_intersect_preliminary(ray, active=active)
             active &= pi.is_valid()
-            number = dr.reinterpret_array(mi.UInt32, pi.shape)
-            first = dr.gather(mi.UInt32, self._first_face, number, active & (number < dr.width(self._first_face)))
-            is_mesh = active & (first > 0)
-            face = dr.select(is_mesh, first - 1 + pi.prim_index, 0)
+            # In a shape group, Mitsuba numbers the shapes from 0.
+            shape, instance = (dr.reinterpret_array(mi.UInt32, s) for s in (pi.shape, pi.instance))
+            number = dr.select(instance != 0, instance, shape)
+            mesh = dr.gather(mi.UInt32, self._first_mesh, number, active & (number < dr.width(self._first_mesh)))
+            is_mesh = active & (mesh > 0)
+            mesh = dr.select(is_mesh, mesh - 1 + dr.select(instance != 0, pi.shape_index, 0), 0)
+            face = dr.select(is_mesh, dr.gather(mi.UInt32, self._first_face, mesh) + pi.prim_index, 0)
             vertices = [dr.gather(mi.UInt32, corner, face, is_mesh) for corner in self._faces]
             places = [dr.gather(mi.UInt32, self._place, v, is_mesh) for v in vertices]
             among = lambda corner: (places[0] == corner) | (places[1] == corner) | (places[2] == corner)
             foreign = is_mesh & ~among(ends[0]) & ~among(ends[1])
-            mesh = dr.gather(mi.UInt32, self._mesh_of_face, face, is_mesh)
             other, met = [point(v) for v in vertices], ray(pi.t)
             for side, mine in enumerate(own):
                 lower, upper, cut = common_line(mine, other)
@@ -346,11 +347,11 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
     return {i: np.array([lower[i, row].min(0), upper[i, row].max(0)]) for i, row in enumerate(overlap) if row.any()}
 
 
-def _first_faces(geometry: Geometry) -> mi.UInt32:
-    """By the number that Dr.Jit gives to a shape: the number of its first face, plus 1; 0 if it is no mesh."""
-    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(m))[0]) for m in geometry.meshes]
+def _first_meshes(geometry: Geometry) -> mi.UInt32:
+    """By the number that Dr.Jit gives to a shape: the number of its mesh, or of an instance's first one, plus 1. Else 0."""
+    numbers = [number_of(getattr(m, "instance", m)) for m in geometry.meshes]
     table = np.zeros(max(numbers, default=0) + 1, np.uint32)
-    table[numbers] = 1 + np.cumsum([0, *(m.face_count() for m in geometry.meshes)])[:-1]
+    table[numbers[::-1]] = np.arange(len(numbers), 0, -1)
     return mi.UInt32(table)
 
 

@@ -33,7 +33,8 @@ class Geometry:
 
     meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known.
     analytic : spheres, disks, cylinders, whose outlines are known curves.
-    others : all else (instances, hair, ...). They occlude and receive light, but must not move.
+    others : all else (hair, ...; instances, until `Instances` finds their meshes). They occlude and receive light, but
+        must not move.
     lines : in which the meshes cut through each other (`Intersections`), whose vertices then come after those of the
         meshes; None: there are none.
     """
@@ -76,7 +77,7 @@ class Geometry:
         ------
         RuntimeError : one of `others`, or a shape in a group, carries a gradient in one of its own parameters.
         """
-        known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
+        known = {int(s.ptr) for s in (*self.meshes, *self.analytic) if inner(s) is s}
         for name, node, *_ in changing:
             if isinstance(node, mi.Shape) and int(node.ptr) not in known:
                 raise Refusal(
@@ -155,7 +156,7 @@ def is_flipped(mesh: Any) -> bool:
 
 
 def is_moving(mesh: Any) -> bool:
-    """Do the positions carry a gradient?"""
+    """Do the positions carry a gradient? Those of instances never do."""
     return dr.grad_enabled(mesh.vertex_positions_buffer() if hasattr(mesh, OLD) else mesh.positions())
 
 
@@ -168,7 +169,7 @@ def is_positions_key(key: str) -> bool:
 def attribute_names(mesh: Any, of: str = "vertex_") -> list[str]:
     """Names of the attributes of the vertices, or ``face_`` of the faces."""
     known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
-    return [name for name in mi.traverse(mesh).properties if name.startswith(of) and name not in known]
+    return [name for name in mi.traverse(inner(mesh)).properties if name.startswith(of) and name not in known]
 
 
 def _of_vertices(values: mi.TensorXf, index: mi.UInt32) -> mi.Float:
@@ -241,7 +242,7 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     anisotropic materials, bump and normal maps."""
     if attribute_names(mesh, "face_"):
         return True
-    objects = list(objects_below(mesh).values())
+    objects = list(objects_below(inner(mesh)).values())
     if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or is_map(o)) for o in objects):
         return True
     return not has_texcoords(mesh) and any(has_place(o) for o in objects)
@@ -260,7 +261,7 @@ def lets_rays_through(shape: Any) -> bool:
 
 def has_normal_map(shape: Any) -> bool:
     """Is a shape shaded by other normals than its own, or those of its vertices?"""
-    return any(isinstance(o, mi.BSDF) and is_map(o) for o in objects_below(shape).values())
+    return any(isinstance(o, mi.BSDF) and is_map(o) for o in objects_below(inner(shape)).values())
 
 
 def is_map(bsdf: mi.BSDF) -> bool:
@@ -278,6 +279,35 @@ def _concat(buffers: list[mi.Float]) -> mi.Float:
     if not buffers:
         return dr.zeros(mi.Float, 3)
     return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
+
+
+def inner(shape: Any) -> Any:
+    """A shape itself; of a mesh as an instance shows it (`MeshOfInstance`), the mesh in the shape group."""
+    return getattr(shape, "inner", shape)
+
+
+def number_of(shape: Any) -> int:
+    """By which Dr.Jit tells a shape from others."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
+def is_met(pi: mi.PreliminaryIntersection3f, shape: Any) -> mi.Bool:
+    """Is it this shape, or instance, that a ray has met?"""
+    return (pi.shape == mi.ShapePtr(shape)) | (pi.instance == mi.ShapePtr(shape))
+
+
+def surfaces(scene: mi.Scene) -> list[Any]:
+    """All shapes that can be met: those of the scene, and in place of instances those in shape groups."""
+    shapes = [s for s in scene.shapes() if s.class_name() != "Instance"]
+    if len(shapes) == len(scene.shapes()):
+        return shapes
+    return [*shapes, *(s for group in shape_groups(scene) for s in group)]
+
+
+def shape_groups(scene: mi.Scene) -> list[list[Any]]:
+    """The shapes in each shape group of a scene."""
+    groups = [o for o in objects_below(scene).values() if o.class_name() == "ShapeGroupPlugin"]
+    return [[s for s in objects_below(g).values() if isinstance(s, mi.Shape) and s is not g] for g in groups]
 
 
 def objects_below(root: mi.Object) -> dict[str, Any]:
