@@ -29,7 +29,7 @@ def cut_curves(scene: mi.Scene, geometry: Geometry) -> list[tuple[mi.Shape, mi.S
             ray.maxt = mi.Float(np.float32(length))
             met = scene.ray_intersect_preliminary(ray)
             others = [s for s in scene.shapes() if s is not shape and shape.bbox().overlaps(s.bbox())]
-            found += [(shape, s) for s in others if dr.any(met.is_valid() & is_met(met, s))[0]]
+            found += [(shape, s) for s in others if dr.any(met.is_valid() & is_met(met, mi.ShapePtr(s)))[0]]
     return found
 
 

@@ -348,7 +348,7 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
 
 
 def _first_meshes(geometry: Geometry) -> mi.UInt32:
-    """By the number that Dr.Jit gives to a shape: the number of its mesh, or of an instance's first one, plus 1. Else 0."""
+    """By the number that Dr.Jit gives to a shape: that of its mesh, or of an instance's first one, plus 1. Else 0."""
     numbers = [number_of(getattr(m, "instance", m)) for m in geometry.meshes]
     table = np.zeros(max(numbers, default=0) + 1, np.uint32)
     table[numbers[::-1]] = np.arange(len(numbers), 0, -1)

@@ -77,13 +77,13 @@ class Geometry:
         ------
         RuntimeError : one of `others`, or a shape in a group, carries a gradient in one of its own parameters.
         """
-        known = {int(s.ptr) for s in (*self.meshes, *self.analytic) if inner(s) is s}
+        known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
         for name, node, *_ in changing:
             if isinstance(node, mi.Shape) and int(node.ptr) not in known:
                 raise Refusal(
                     f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{name}" carries a gradient), but its '
                     "silhouettes cannot be sampled: only triangle meshes, spheres, disks and cylinders outside of "
-                    "shape groups can move. Replace it by such a mesh, or detach it."
+                    "shape groups can move, and instances of meshes. Replace it by such a mesh, or detach it."
                 )
 
     def positions(self) -> mi.Float:
@@ -156,7 +156,7 @@ def is_flipped(mesh: Any) -> bool:
 
 
 def is_moving(mesh: Any) -> bool:
-    """Do the positions carry a gradient? Those of instances never do."""
+    """Do the positions carry a gradient?"""
     return dr.grad_enabled(mesh.vertex_positions_buffer() if hasattr(mesh, OLD) else mesh.positions())
 
 
@@ -291,9 +291,14 @@ def number_of(shape: Any) -> int:
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
-def is_met(pi: mi.PreliminaryIntersection3f, shape: Any) -> mi.Bool:
-    """Is it this shape, or instance, that a ray has met?"""
-    return (pi.shape == mi.ShapePtr(shape)) | (pi.instance == mi.ShapePtr(shape))
+def pointer(shape: Any) -> mi.ShapePtr:
+    """To a shape; to the instance that shows a mesh (`MeshOfInstance`)."""
+    return mi.ShapePtr(getattr(shape, "instance", shape))
+
+
+def is_met(met: mi.PreliminaryIntersection3f | mi.SurfaceInteraction3f, pointer: mi.ShapePtr) -> mi.Bool:
+    """Is it this shape, or this instance, that a ray has met?"""
+    return (met.shape == pointer) | (met.instance == pointer)
 
 
 def surfaces(scene: mi.Scene) -> list[Any]:

@@ -231,7 +231,9 @@ class BoundarySearch:
         (The camera alone moves neither.)"""
         planes = FacePlanes(scene)
         what_lights = moving.lights or (moving.shapes and self.depths.scatters(2))
-        return planes if planes.shapes and (what_lights or any(s in moving.shapes for s in planes.shapes)) else None
+        return (
+            planes if planes.shapes and (what_lights or any(inner(m) in planes.shapes for m in moving.shapes)) else None
+        )
 
     def _limits_of_sensor(self, sensor: mi.Sensor, moving: Moving) -> list[str]:
         """What the derivative will lack as seen from this sensor. Found once, since it looks at positions."""

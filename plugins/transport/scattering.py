@@ -241,7 +241,7 @@ class Scattering:
                         wrong |= bsdf == other
                     p = dr.detach(turned.pdf)
                     at_mirror *= dr.select(wrong & (p > 0), turned.pdf / dr.select(p > 0, p, 1), 1)
-                    y = dr.select(mirrored, shown_by_mirror(si, turned.wo, ray, pi, active & mirrored), y)
+                    y = dr.select(mirrored, shown_by_mirror(scene, si, turned.wo, ray, pi, active & mirrored), y)
                     attached, scattered = (dr.select(mirrored, at_mirror, x) for x in (attached, scattered))
                     if vicinity is not None:
                         d = dr.select(mirrored & active, si.to_world(turned.wo), ray.d)
