@@ -86,6 +86,6 @@ TURN = {"key": "chair1.to_world", "rotate": [0.2, 1, 0.1]}
 #: Of each case: scene, motion, step, max_depth.
 INSTANCES: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "chair_slides": (chairs, SLIDE, 4e-3, 2),
-    "chair_turns": (chairs, TURN, 8e-3, 3),
+    "chair_turns": (chairs, TURN, 8e-3, 2),
     "stretched_ball": (stretched_ball, {"key": "thing.to_world", "rotate": [1, 0.4, 0.7]}, 6e-3, 2),
 }

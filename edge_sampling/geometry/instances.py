@@ -194,7 +194,7 @@ def _attach(si, to_world: mi.AffineTransform4f, ray, pi, flags, active) -> None:
     u, v = pi.prim_uv
     attached = {"n": n}
     if not flags & mi.RayFlags.FollowShape:
-        # The ray and the plane of the triangle: Möller and Trumbore 1997, Eq. 6.
+        # Where the ray meets the plane of the triangle, and its parts of the area there.
         attached["t"] = t = dr.dot(n, p - ray.o) / dr.dot(n, ray.d)
         there, area = ray(t) - p, dr.cross(a, b)
         u, v = (dr.dot(area, dr.cross(*pair)) / dr.squared_norm(area) for pair in ((there, b), (a, there)))
@@ -224,7 +224,8 @@ def _meshes_of(scene: mi.Scene, instances: list[Any]) -> list[MeshOfInstance]:
         met.t, met.valid = mi.Float(1), mi.Bool(True)
         numbers = [number_of(i) for i in instances]
         met.instance = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(numbers))
-        first = met.compute_surface_interaction(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))).shape
+        ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
+        first = met.compute_surface_interaction(ray, mi.RayFlags.FollowShape).shape
         firsts = dr.reinterpret_array(mi.UInt32, first).numpy().tolist()
     found = []
     for instance, number in zip(instances, firsts, strict=True):

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import collect_before
+from rimlight._plan import names
 from rimlight.edge_sampling import (
     Edges,
     FacePlanes,
@@ -178,7 +179,18 @@ class BoundarySearch:
 
     # ---------------------- Boundaries ----------------------
 
+    def _refuse_instances(self, moving: Moving) -> None:
+        """Refuse instances that move, and on which the jumps are not known that lie inside of faces."""
+        instances = [s for s in moving.shapes if inner(s) is not s]
+        jumps = names(s for s in instances if is_mirror(s) or len(TextureLines([inner(s)])))
+        if jumps:
+            raise Refusal(
+                f"{self.who}: instances {', '.join(jumps)} move, and are mirrors or glass, or their textures or bump "
+                "maps jump: where the jumps go is not known. Replace them by meshes."
+            )
+
     def _find(self, scene: mi.Scene, moving: Moving, sppi: int) -> Boundaries:
+        self._refuse_instances(moving)
         lights = Lights(scene)
         on_film = np.array([m or moving.camera for m in moving.flags], bool)
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import building
 import drjit as dr
 import instances
 import mitsuba as mi
@@ -90,3 +91,16 @@ def test_lines_in_which_an_instance_cuts_through_a_mesh():
         lengths.append(dr.sum(dr.norm(upper - lower))[0])
     assert found[0][0].count == found[1][0].count > 8
     assert lengths[0] == pytest.approx(lengths[1], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [{"type": "conductor"}, {"type": "diffuse", "reflectance": {"type": "checkerboard"}}],
+    ids=lambda b: b["type"],
+)
+def test_jumps_inside_of_faces_are_refused(bsdf):
+    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": bsdf}}
+    thing = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    scene = building.scene(sensor=building.camera(), group=group, thing=thing, **instances.room())
+    with pytest.raises(RuntimeError, match='instances "thing" move, and are mirrors'):
+        forward(scene, mi.load_dict(INTEGRATORS["direct_edge"]), 1, key="thing.to_world", direction=[1, 0, 0])
