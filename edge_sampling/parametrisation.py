@@ -36,7 +36,6 @@ import drjit as dr
 import mitsuba as mi
 
 from .geometry.instances import surface_met
-from .geometry.meshes import is_met
 from .smooth_lamps import SmoothLamps
 
 #: All that is known of a surface that is met, at a point that follows it.
@@ -274,8 +273,9 @@ class Parametrisation:
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
         on_mesh, on_other = mi.Bool(False), mi.Bool(False)
         for shape, is_mesh in self.moving:
-            on_mesh |= is_mesh & is_met(pi, shape)
-            on_other |= (not is_mesh) & is_met(pi, shape)
+            met = (pi.shape == shape) | (pi.instance == shape)
+            on_mesh |= is_mesh & met
+            on_other |= (not is_mesh) & met
         on_mesh, on_other = on_mesh & active, on_other & active
         # Of a triangle, twice its area.
         corners = []

@@ -42,7 +42,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     light that moves takes its samples along (as in path-space differentiation, Zhang et al. 2020). So it needs no
     boundary unless something occludes it.
 
-    **Limits.** Only triangle meshes and instances of them, spheres, disks and cylinders can move: moving hair is refused,
+    **Limits.** Only triangle meshes and their instances, spheres, disks and cylinders can move: moving hair is refused,
     and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and
     cylinders cut through other shapes, or the far clipping plane through any, and shadows of hair, ... on
     what moves. Warned about, too: jumps at T-junctions, which count twice, and participating
