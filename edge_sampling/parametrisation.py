@@ -35,7 +35,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .geometry.instances import surface_met
 from .smooth_lamps import SmoothLamps
+
+#: All that is known of a surface that is met, at a point that follows it.
+FOLLOWS = mi.RayFlags.All | mi.RayFlags.FollowShape
 
 #: Cosine below which a surface that is no mesh is taken to stand still. Where a fixed ray meets a curved one, and the
 #: solid angle that an element of it covers, change as 1 / cos; single precision does not know cosines of 1e-4, and
@@ -53,12 +57,12 @@ FLUSH = 16
 
 
 def seen_by_camera(
-    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool, *, attached: bool
+    scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool, *, attached: bool
 ) -> mi.SurfaceInteraction3f:
     """The surface that a camera ray meets. A surface that moves is met by a fixed ray; a ray that moves with the camera
     takes its hit along. With all its derivatives but where the surface is curved, and seen edge-on."""
     with dr.resume_grad(when=attached):
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        si = surface_met(scene, ray, pi, mi.RayFlags.All, active)
         if attached:
             si = dr.select(grazes(si, ray.d, active), dr.detach(si), si)
         return si
@@ -70,19 +74,20 @@ def material_point(
     active: mi.Bool,
     flags: mi.RayFlags = mi.RayFlags.Minimal,
 ) -> mi.SurfaceInteraction3f:
-    """What a ray meets; it follows its surface, attached unless gradients are suspended."""
+    """What a ray meets; it follows its surface, attached unless gradients are suspended. Of instances, only points are
+    attached: `surface_met` has all."""
     return pi.compute_surface_interaction(ray, flags | mi.RayFlags.FollowShape, active)
 
 
 def sliding_point(
-    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, held: mi.Float, active: mi.Bool
+    scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, held: mi.Float, active: mi.Bool
 ) -> mi.SurfaceInteraction3f:
     """What a ray meets, attached to the surface and to the ray: the part `held` of its motion is that of the material
     point, the rest that of the point where the ray meets the surface."""
-    si = material_point(dr.detach(ray), pi, active, mi.RayFlags.All)
+    si = surface_met(scene, dr.detach(ray), pi, FOLLOWS, active)
     slides = active & (dr.detach(held) < 1)
     slides &= ~grazes(si, ray.d, slides)
-    slid = pi.compute_surface_interaction(ray, mi.RayFlags.All, slides)
+    slid = surface_met(scene, ray, pi, mi.RayFlags.All, slides)
 
     def blend(a, b):
         if not dr.grad_enabled(a, b):
@@ -97,13 +102,18 @@ def sliding_point(
 
 
 def shown_by_mirror(
-    si: mi.SurfaceInteraction3f, wo: mi.Vector3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    wo: mi.Vector3f,
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    active: mi.Bool,
 ) -> mi.SurfaceInteraction3f:
     """The surface that a ray meets which leaves `si` in the direction `wo` of its frame, both attached: what a mirror
     shows slides over the surface."""
     turned = mi.Ray3f(ray)
     turned.o, turned.d = si.p, si.to_world(wo)
-    return pi.compute_surface_interaction(turned, mi.RayFlags.All, active)
+    return surface_met(scene, turned, pi, mi.RayFlags.All, active)
 
 
 def look_from(si: mi.SurfaceInteraction3f, x: mi.Point3f, ray: mi.Ray3f, t: mi.Float) -> None:
@@ -230,13 +240,15 @@ class Parametrisation:
     """
 
     def __init__(self, scene: mi.Scene):
-        self.moving = [(mi.ShapePtr(s), s.is_mesh()) for s in scene.shapes() if s.parameters_grad_enabled()]
+        self.scene = scene
+        moving = [s for s in scene.shapes() if s.parameters_grad_enabled()]
+        self.moving = [(mi.ShapePtr(s), s.is_mesh() or s.class_name() == "Instance") for s in moving]
         self.any_curved = any(not s.is_mesh() for s in scene.shapes())
         self.smooth_lamps = SmoothLamps(scene)
 
     def connect(self, si, pi, ray, active, *, by_light: bool) -> Connection:
         """What joins `si` to the material point that `pi` stands for, found by a sample of a light or of the BSDF."""
-        y = material_point(ray, pi, active, mi.RayFlags.All)
+        y = surface_met(self.scene, ray, pi, FOLLOWS, active)
         d = y.p - si.p
         r2 = dr.squared_norm(d)
         ω = d * dr.rsqrt(r2)
@@ -261,8 +273,9 @@ class Parametrisation:
         """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
         on_mesh, on_other = mi.Bool(False), mi.Bool(False)
         for shape, is_mesh in self.moving:
-            on_mesh |= is_mesh & (pi.shape == shape)
-            on_other |= (not is_mesh) & (pi.shape == shape)
+            met = (pi.shape == shape) | (pi.instance == shape)
+            on_mesh |= is_mesh & met
+            on_other |= (not is_mesh) & met
         on_mesh, on_other = on_mesh & active, on_other & active
         # Of a triangle, twice its area.
         corners = []

@@ -29,6 +29,7 @@ from building import (
     scene,
 )
 from cuts import CUTS
+from instances import INSTANCES
 from mirrors import MIRRORS, ball_of_index
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
@@ -899,6 +900,10 @@ CASES = [
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096)
         for k, (*of, depth) in (CUTS | MIRRORS | BEAMS).items()
+    ),
+    *(
+        Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k == "chair_slides" else 1024)
+        for k, (*of, depth) in INSTANCES.items()
     ),
 ]
 

@@ -69,6 +69,18 @@ def knot() -> mi.Scene:
     return scene(sensor=camera((0.6, 1.6, -3.4), (0.1, 0.7, 0)), knot=both, floor=floor, lamp=lamp())
 
 
+def spike() -> mi.Scene:
+    """Half of a pyramid lies in a floor, with whose triangles it has the corner at its tip in common."""
+    base = [[1.5, y, z] for y, z in ((-0.5, -0.4), (0.6, -0.6), (0.5, 0.4), (-0.4, 0.5))]
+    faces = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [1, 3, 2], [1, 4, 3]]
+    tip = np.array([-0.5, 0, -0.2])
+    thing = mesh("spike", np.add([[0, 0, 0], *base], tip), faces, bsdf=diffuse(0.8, 0.5, 0.3, two_sided=True))
+    around = [[-2, 0, -2], [2, 0, -2], [2, 0, 2], [-2, 0, 2]]
+    fan = [[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4]]
+    floor = mesh("floor", np.array([tip, *around]), fan, bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
+    return scene(sensor=camera(*LOOK), spike=thing, floor=floor, lamp=lamp())
+
+
 SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0, 0.3]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
 SINK = {"key": "cube.vertex_positions", "direction": [0, -1, 0]}
@@ -77,6 +89,7 @@ CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0]}
 BALL = {"key": "ball.vertex_positions", "direction": [0.77, 0.5, -0.3]}
 BOARD = {"key": "board.vertex_positions", "direction": [1, 0.2, 0]}
 DEFORM = {"key": "knot.vertex_positions", "direction": [1, 0.3, 0], "vertices": list(range(8))}
+TILT = {"key": "spike.vertex_positions", "direction": [0, 1, 0.7], "vertices": [1, 2, 3, 4]}
 
 #: Of each case: scene, motion, step, max_depth.
 CUTS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
@@ -90,4 +103,5 @@ CUTS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "sunk_ball": (sunk_ball, BALL, 4e-3, 2),
     "cut_lamp": (cut_lamp, BOARD, 6e-3, 2),
     "knot": (knot, DEFORM, 4e-3, 2),
+    "spike": (spike, TILT, 4e-3, 2),
 }

@@ -20,7 +20,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth, surfaces
 from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.rays import spawn_ray
 
@@ -36,7 +36,7 @@ class FacePlanes:
     DRJIT_STRUCT = dict.fromkeys(("_shapes",))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene):
-        self.shapes = [s for s in scene.shapes() if (s.is_mesh() and is_smooth(s)) or has_normal_map(s)]
+        self.shapes = [s for s in surfaces(scene) if (s.is_mesh() and is_smooth(s)) or has_normal_map(s)]
         self._shapes = [mi.ShapePtr(s) for s in self.shapes]
 
     def sample(self, tracer: Tracer, point: ShadingPoint, sampler: mi.Sampler) -> mi.Spectrum:

@@ -28,7 +28,7 @@ from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
 from rimlight.edge_sampling.choice.sampling import EdgeSample, Reservoir, power_heuristic
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Cone, Lobe, View
-from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals
+from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals, is_met, pointer
 from rimlight.edge_sampling.parametrisation import Vicinity, in_plane, material_point
 from rimlight.edge_sampling.rays import spawn_ray
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
@@ -69,7 +69,7 @@ class ShadingBoundary:
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None):
         self.silhouettes = silhouettes
         self.geometry = geometry = silhouettes.geometry
-        self.moving_shapes = None if moving is None else [mi.ShapePtr(s) for s in moving]
+        self.moving_shapes = None if moving is None else [pointer(s) for s in moving]
         self.boxes = EmitterBoxes(scene, geometry)
         self.smooth_lamps = SmoothLamps(scene)
         lamps = [e.get_shape() for e in scene.emitters() if e.flags() & mi.EmitterFlags.Surface]
@@ -125,7 +125,7 @@ class ShadingBoundary:
             bsdf = si.bsdf()
             moves = mi.Bool(self.moving_shapes is None)
             for shape in self.moving_shapes or ():
-                moves |= si.shape == shape
+                moves |= is_met(si, shape)
             active = point.active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
             # ---------------------- Emitted light, or scattered ----------------------

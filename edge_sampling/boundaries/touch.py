@@ -52,7 +52,7 @@ def touch_outline(
     ray : one of both. near : the one that meets it, and what that is. far : the other one.
     reach : about how far the two are apart there, scene units.
     """
-    is_mesh = near[1].shape.is_mesh()
+    is_mesh = near[1].shape.is_mesh() | (near[1].instance != None)  # noqa: E711
     on_mesh = _of_mesh(ray, near, far, active & is_mesh)
     if all(s.is_mesh() for s in scene.shapes()):
         return on_mesh

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .meshes import Geometry
+from .meshes import Geometry, is_met
 
 #: Lines over a shape, in each of two directions, along which others are sought.
 LINES = 24
@@ -29,7 +29,7 @@ def cut_curves(scene: mi.Scene, geometry: Geometry) -> list[tuple[mi.Shape, mi.S
             ray.maxt = mi.Float(np.float32(length))
             met = scene.ray_intersect_preliminary(ray)
             others = [s for s in scene.shapes() if s is not shape and shape.bbox().overlaps(s.bbox())]
-            found += [(shape, s) for s in others if dr.any(met.is_valid() & (met.shape == mi.ShapePtr(s)))[0]]
+            found += [(shape, s) for s in others if dr.any(met.is_valid() & is_met(met, mi.ShapePtr(s)))[0]]
     return found
 
 

@@ -3,7 +3,8 @@
 Two triangles that cut each other have a piece of a line in common, along n₁ × n₂. Its ends are where an edge of one
 goes through the face of the other. So rays along all edges find the pairs of triangles: an edge that goes through a
 face makes one pair of each of its own faces with that face. Each pair is found twice, once from each end of its piece,
-and counts where it is found from the lower one.
+and counts where it is found from the lower one. (Of triangles with a corner in common, the piece has one end there, and
+is found from the other.)
 
 The line moves as the planes do. A point p of it has no velocity of its own along the line; across it, ṗ = α n₁ + β n₂
 with α and β such that p stays in both planes: nᵢ · ṗ = −ġᵢ, gᵢ = nᵢ · (p − cᵢ) with a corner cᵢ. What is seen on
@@ -20,7 +21,8 @@ import numpy as np
 
 from .device_edges import rounding
 from .edges import EdgeKind, Edges, Weld
-from .meshes import Geometry, positions_of
+from .meshes import Geometry, number_of, positions_of
+from .rigid_motion import Shapes
 
 #: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
 IN_ONE_PLANE = 1e-4
@@ -41,17 +43,25 @@ LEAST_SPACE = 64
 @dataclass(frozen=True)
 class _Walked:
     """Edges along which rays are traced, on the device: their end points, the third vertices of their two faces; have
-    they two? And of which mesh they are."""
+    they two? And of which meshes these are."""
 
     ends: list[mi.UInt32]
     opposite: list[mi.UInt32]
     two: mi.Bool
-    mesh: mi.UInt32
+    mesh: list[mi.UInt32]
 
     @staticmethod
     def of(edges: Edges) -> _Walked:
-        ends, opposite = ([_index(v[:, k]) for k in (0, 1)] for v in (edges.vertices[:, 0], edges.opposite))
-        return _Walked(ends, opposite, mi.Bool(edges.count > 1), _index(edges.mesh[:, 0]))
+        each = edges.vertices[:, 0], edges.opposite, edges.mesh
+        ends, opposite, mesh = ([_index(v[:, k]) for k in (0, 1)] for v in each)
+        return _Walked(ends, opposite, mi.Bool(edges.count > 1), mesh)
+
+    def take(self, which: mi.UInt32) -> _Walked:
+        of = lambda numbers: [dr.gather(mi.UInt32, n, which) for n in numbers]
+        return _Walked(of(self.ends), of(self.opposite), dr.gather(mi.Bool, self.two, which), of(self.mesh))
+
+    def __len__(self) -> int:
+        return dr.width(self.two)
 
 
 class Intersections:
@@ -70,11 +80,10 @@ class Intersections:
         self._edges, self._place = edges, _index(weld.place)
         faces = geometry.faces((True,) * len(geometry.meshes))
         self._faces = [_index(faces[:, k]) for k in range(3)]
-        self._first_face = _first_faces(geometry)
-        #: The mesh of each face, on the device.
+        self._first_mesh = _first_meshes(geometry)
         counts = [m.face_count() for m in geometry.meshes]
+        self._first_face = _index(np.cumsum([0, *counts]))
         self._meshes = len(counts)
-        self._mesh_of_face = _index(np.repeat(np.arange(self._meshes), counts))
         self._walked: dict[tuple[int, ...], _Walked] = {}
         #: Where the meshes were (held, so that the number of an array is given to no other one).
         self._at: list[mi.Float] | None = None
@@ -83,8 +92,9 @@ class Intersections:
         self.meshes: tuple[int, ...] = ()
         #: Six vertices of each pair of triangles: (capacity,) each.
         self.corners: list[mi.UInt32] = []
-        #: Meshes that cut through themselves. (Those that come to do so later are not noticed.)
-        self._by_themselves = self._find_themselves(scene, geometry)
+        #: Meshes that cut through themselves. Others may come to do so when their shapes change.
+        self._by_themselves: set[int] = set()
+        self._shapes = Shapes(geometry)
 
     # ---------------------- Search ----------------------
 
@@ -96,27 +106,37 @@ class Intersections:
             return False
         self._at = arrays
         before = self.meshes, self.capacity
-        everywhere = {i: np.array([[-np.inf] * 3, [np.inf] * 3]) for i in self._by_themselves}
-        boxes = _overlapping(geometry) | everywhere
-        self.meshes = meshes = tuple(sorted(boxes))
-        if not meshes:
-            self._keep([], 0)
-            return bool(self.capacity) and before != (meshes, self.capacity)
+        boxes = _overlapping(geometry)
         with dr.suspend_grad():
-            walked, positions = self._edges_of(meshes), dr.detach(replace(geometry, lines=None).positions())
-            within = np.zeros((self._meshes, 2, 3), np.float32)
-            within[list(meshes)] = [boxes[i] for i in meshes]
-            within = mi.Float(within.ravel())
-            counts = self._walk(scene, positions, walked, within)
-            ends = dr.cumsum(counts)
-            count = int(ends[-1])
-            if count > self.capacity:
-                self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
-            found = [dr.zeros(mi.UInt32, max(count, 1)) for _ in range(CORNERS)]
-            if count:
-                self._walk(scene, positions, walked, within, into=found, start=ends - counts)
-            self._keep(found, count)
-        return bool(self.capacity) and before != (meshes, self.capacity)
+            alone = self._shapes.changed(arrays) | self._by_themselves
+            everywhere = {i: np.array([[-np.inf] * 3, [np.inf] * 3]) for i in alone}
+            self._search(scene, dr.detach(replace(geometry, lines=None).positions()), boxes | everywhere)
+        self.meshes = tuple(sorted(boxes.keys() | self._by_themselves))
+        return bool(self.capacity) and before != (self.meshes, self.capacity)
+
+    def _search(self, scene: mi.Scene, positions: mi.Float, boxes: dict[int, np.ndarray]) -> None:
+        """Find the pairs, and which meshes cut through themselves. boxes : meshes, and where to look for what cuts
+        each: (2, 3)."""
+        walked = self._edges_of(tuple(sorted(boxes)))
+        if not len(walked):
+            self._keep([], 0)
+            return
+        within = np.zeros((self._meshes, 2, 3), np.float32)
+        within[list(boxes)] = list(boxes.values())
+        within = mi.Float(within.ravel())
+        by_themselves = dr.zeros(mi.UInt32, self._meshes)
+        counts = self._walk(scene, positions, walked, within, by_themselves=by_themselves)
+        ends = dr.cumsum(counts)
+        count, *flags = dr.concat([dr.gather(mi.UInt32, ends, dr.width(ends) - 1), by_themselves]).numpy().tolist()
+        self._by_themselves = {i for i, flag in enumerate(flags) if flag}
+        if count > self.capacity:
+            self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
+        found = [dr.zeros(mi.UInt32, max(count, 1)) for _ in range(CORNERS)]
+        if count:
+            cutting = dr.compress(counts > 0)
+            start = dr.gather(mi.UInt32, ends - counts, cutting)
+            self._walk(scene, positions, walked.take(cutting), within, into=found, start=start)
+        self._keep(found, count)
 
     def _keep(self, found: list[mi.UInt32], count: int) -> None:
         """Fill up what is not needed with a vertex, which makes triangles without area."""
@@ -133,66 +153,64 @@ class Intersections:
             self._walked[meshes] = _Walked.of(self._edges.of_meshes(wanted))
         return self._walked[meshes]
 
-    def _find_themselves(self, scene: mi.Scene, geometry: Geometry) -> set[int]:
-        if not len(self._edges):
-            return set()
-        with dr.suspend_grad():
-            walked = _Walked.of(self._edges)
-            counts = self._walk(scene, dr.detach(geometry.positions()), walked, themselves=True)
-        return set(walked.mesh.numpy()[counts.numpy() > 0].tolist())
-
     def _walk(
         self,
         scene: mi.Scene,
         positions: mi.Float,
         walked: _Walked,
-        within: mi.Float | None = None,
+        within: mi.Float,
         *,
         into: list[mi.UInt32] | None = None,
         start: mi.UInt32 | None = None,
-        themselves: bool = False,
+        by_themselves: mi.UInt32 | None = None,
     ) -> mi.UInt32:
         """Follow each edge through all the faces that it goes through; how many pairs it finds from their lower ends:
         (E,).
 
         within : for each mesh, the lower and the upper corner of a box outside of which nothing cuts it, (6 M,).
         into, start : where to write the vertices of the pairs, from where on for each edge.
-        themselves : only those within one mesh.
+        by_themselves : where to note the meshes that cut through themselves.
         """
         point = lambda i: dr.gather(mi.Point3f, positions, i)
         a, b = (point(e) for e in walked.ends)
         own = [[a, b, point(o)] for o in walked.opposite]
-        place = [dr.gather(mi.UInt32, self._place, e) for e in walked.ends]
+        ends, third = ([dr.gather(mi.UInt32, self._place, v) for v in vs] for vs in (walked.ends, walked.opposite))
         length = dr.norm(b - a)
         d = (b - a) / length
         step = rounding(a, b)
         active = (length > 0) & dr.isfinite(length)
-        if within is not None:
-            lower, upper = (dr.gather(mi.Point3f, within, 2 * walked.mesh + k) for k in (0, 1))
-            active &= dr.all((dr.maximum(a, b) >= lower - step) & (dr.minimum(a, b) <= upper + step))
+        inside = mi.Bool(False)
+        for mesh in walked.mesh:
+            lower, upper = (dr.gather(mi.Point3f, within, 2 * mesh + k) for k in (0, 1))
+            inside |= dr.all((dr.maximum(a, b) >= lower - step) & (dr.minimum(a, b) <= upper + step))
+        active &= inside
 
         def through(t, count, k, active):
             ray = mi.Ray3f(mi.Point3f(a + t * d), d)
             ray.maxt = length - t
             pi = scene.ray_intersect_preliminary(ray, active=active)
             active &= pi.is_valid()
-            number = dr.reinterpret_array(mi.UInt32, pi.shape)
-            first = dr.gather(mi.UInt32, self._first_face, number, active & (number < dr.width(self._first_face)))
-            is_mesh = active & (first > 0)
-            face = dr.select(is_mesh, first - 1 + pi.prim_index, 0)
+            # In a shape group, Mitsuba numbers the shapes from 0.
+            shape, instance = (dr.reinterpret_array(mi.UInt32, s) for s in (pi.shape, pi.instance))
+            number = dr.select(instance != 0, instance, shape)
+            mesh = dr.gather(mi.UInt32, self._first_mesh, number, active & (number < dr.width(self._first_mesh)))
+            is_mesh = active & (mesh > 0)
+            mesh = dr.select(is_mesh, mesh - 1 + dr.select(instance != 0, pi.shape_index, 0), 0)
+            face = dr.select(is_mesh, dr.gather(mi.UInt32, self._first_face, mesh) + pi.prim_index, 0)
             vertices = [dr.gather(mi.UInt32, corner, face, is_mesh) for corner in self._faces]
-            foreign = mi.Bool(is_mesh)
-            for v in vertices:
-                at = dr.gather(mi.UInt32, self._place, v, is_mesh)
-                foreign &= (at != place[0]) & (at != place[1])
-            if themselves:
-                foreign &= dr.gather(mi.UInt32, self._mesh_of_face, face, is_mesh) == walked.mesh
+            places = [dr.gather(mi.UInt32, self._place, v, is_mesh) for v in vertices]
+            among = lambda corner: (places[0] == corner) | (places[1] == corner) | (places[2] == corner)
+            foreign = is_mesh & ~among(ends[0]) & ~among(ends[1])
             other, met = [point(v) for v in vertices], ray(pi.t)
             for side, mine in enumerate(own):
                 lower, upper, cut = common_line(mine, other)
-                found = foreign & cut & (dr.squared_norm(met - lower) < dr.squared_norm(met - upper))
+                # Through a corner in common, no edge goes: such a pair is found from the other end only.
+                from_lower = dr.squared_norm(met - lower) < dr.squared_norm(met - upper)
+                found = foreign & cut & (from_lower | among(third[side]))
                 if side:
                     found &= walked.two
+                if by_themselves is not None:
+                    dr.scatter(by_themselves, mi.UInt32(1), mesh, found & (mesh == walked.mesh[side]))
                 if into is not None:
                     pair = (*walked.ends, walked.opposite[side], *vertices)
                     for target, v in zip(into, pair, strict=True):
@@ -201,7 +219,7 @@ class Intersections:
             t += pi.t + step
             return t, count, k + 1, active & (t < length) & (k < MOST_FACES)
 
-        width = dr.width(walked.mesh)
+        width = len(walked)
         zero = dr.zeros(mi.UInt32, width)
         state = (dr.zeros(mi.Float, width), mi.UInt32(zero), mi.UInt32(zero), active)
         return dr.while_loop(state, lambda *s: s[-1], through, label="edges through faces")[1]
@@ -329,11 +347,11 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
     return {i: np.array([lower[i, row].min(0), upper[i, row].max(0)]) for i, row in enumerate(overlap) if row.any()}
 
 
-def _first_faces(geometry: Geometry) -> mi.UInt32:
-    """By the number that Dr.Jit gives to a shape: the number of its first face, plus 1; 0 if it is no mesh."""
-    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(m))[0]) for m in geometry.meshes]
+def _first_meshes(geometry: Geometry) -> mi.UInt32:
+    """By the number that Dr.Jit gives to a shape: that of its mesh, or of an instance's first one, plus 1. Else 0."""
+    numbers = [number_of(getattr(m, "instance", m)) for m in geometry.meshes]
     table = np.zeros(max(numbers, default=0) + 1, np.uint32)
-    table[numbers] = 1 + np.cumsum([0, *(m.face_count() for m in geometry.meshes)])[:-1]
+    table[numbers[::-1]] = np.arange(len(numbers), 0, -1)
     return mi.UInt32(table)
 
 

@@ -33,7 +33,8 @@ class Geometry:
 
     meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known.
     analytic : spheres, disks, cylinders, whose outlines are known curves.
-    others : all else (instances, hair, ...). They occlude and receive light, but must not move.
+    others : all else (hair, ...; instances, until `Instances` finds their meshes). They occlude and receive light, but
+        must not move.
     lines : in which the meshes cut through each other (`Intersections`), whose vertices then come after those of the
         meshes; None: there are none.
     """
@@ -82,7 +83,7 @@ class Geometry:
                 raise Refusal(
                     f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{name}" carries a gradient), but its '
                     "silhouettes cannot be sampled: only triangle meshes, spheres, disks and cylinders outside of "
-                    "shape groups can move. Replace it by such a mesh, or detach it."
+                    "shape groups can move, and instances of meshes. Replace it by such a mesh, or detach it."
                 )
 
     def positions(self) -> mi.Float:
@@ -168,7 +169,7 @@ def is_positions_key(key: str) -> bool:
 def attribute_names(mesh: Any, of: str = "vertex_") -> list[str]:
     """Names of the attributes of the vertices, or ``face_`` of the faces."""
     known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
-    return [name for name in mi.traverse(mesh).properties if name.startswith(of) and name not in known]
+    return [name for name in mi.traverse(inner(mesh)).properties if name.startswith(of) and name not in known]
 
 
 def _of_vertices(values: mi.TensorXf, index: mi.UInt32) -> mi.Float:
@@ -241,7 +242,7 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     anisotropic materials, bump and normal maps."""
     if attribute_names(mesh, "face_"):
         return True
-    objects = list(objects_below(mesh).values())
+    objects = list(objects_below(inner(mesh)).values())
     if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or is_map(o)) for o in objects):
         return True
     return not has_texcoords(mesh) and any(has_place(o) for o in objects)
@@ -260,7 +261,7 @@ def lets_rays_through(shape: Any) -> bool:
 
 def has_normal_map(shape: Any) -> bool:
     """Is a shape shaded by other normals than its own, or those of its vertices?"""
-    return any(isinstance(o, mi.BSDF) and is_map(o) for o in objects_below(shape).values())
+    return any(isinstance(o, mi.BSDF) and is_map(o) for o in objects_below(inner(shape)).values())
 
 
 def is_map(bsdf: mi.BSDF) -> bool:
@@ -278,6 +279,40 @@ def _concat(buffers: list[mi.Float]) -> mi.Float:
     if not buffers:
         return dr.zeros(mi.Float, 3)
     return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
+
+
+def inner(shape: Any) -> Any:
+    """A shape itself; of a mesh as an instance shows it (`MeshOfInstance`), the mesh in the shape group."""
+    return getattr(shape, "inner", shape)
+
+
+def number_of(shape: Any) -> int:
+    """By which Dr.Jit tells a shape from others."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
+def pointer(shape: Any) -> mi.ShapePtr:
+    """To a shape; to the instance that shows a mesh (`MeshOfInstance`)."""
+    return mi.ShapePtr(getattr(shape, "instance", shape))
+
+
+def is_met(met: mi.PreliminaryIntersection3f | mi.SurfaceInteraction3f, pointer: mi.ShapePtr) -> mi.Bool:
+    """Is it this shape, or this instance, that a ray has met?"""
+    return (met.shape == pointer) | (met.instance == pointer)
+
+
+def surfaces(scene: mi.Scene) -> list[Any]:
+    """All shapes that can be met: those of the scene, and in place of instances those in shape groups."""
+    shapes = [s for s in scene.shapes() if s.class_name() != "Instance"]
+    if len(shapes) == len(scene.shapes()):
+        return shapes
+    return [*shapes, *(s for group in shape_groups(scene) for s in group)]
+
+
+def shape_groups(scene: mi.Scene) -> list[list[Any]]:
+    """The shapes in each shape group of a scene."""
+    groups = [o for o in objects_below(scene).values() if o.class_name() == "ShapeGroupPlugin"]
+    return [[s for s in objects_below(g).values() if isinstance(s, mi.Shape) and s is not g] for g in groups]
 
 
 def objects_below(root: mi.Object) -> dict[str, Any]:

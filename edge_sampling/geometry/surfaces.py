@@ -26,7 +26,7 @@ class Surfaces:
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
         if not self._any_other:
             return si
-        on_mesh = active & pi.is_valid() & pi.shape.is_mesh()
+        on_mesh = active & pi.is_valid() & si.shape.is_mesh()
         sides = []
         for step in (mi.Vector2f(1, 0), mi.Vector2f(0, 1)):
             beyond = mi.PreliminaryIntersection3f(pi)

@@ -17,7 +17,7 @@ import numpy as np
 
 from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
 from .mapped_horizons import mapped_horizons
-from .meshes import Geometry, has_place, has_texcoords, objects_below, texture_coordinates
+from .meshes import Geometry, has_place, has_texcoords, is_met, objects_below, pointer, texture_coordinates
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class TextureLines:
 def _is_one_of(si: mi.SurfaceInteraction3f, shapes: Sequence[Any]) -> mi.Bool:
     found = mi.Bool(False)
     for shape in shapes:
-        found |= si.shape == mi.ShapePtr(shape)
+        found |= is_met(si, pointer(shape))
     return found
 
 

@@ -16,7 +16,8 @@ import mitsuba as mi
 
 from rimlight.edge_sampling import Horizon, Lights
 from rimlight.edge_sampling.boundaries.horizon import turn_to_side
-from rimlight.edge_sampling.parametrisation import look_from, material_point, seen_by_camera
+from rimlight.edge_sampling.geometry.instances import surface_met
+from rimlight.edge_sampling.parametrisation import FOLLOWS, look_from, seen_by_camera
 from rimlight.transport.paths import Vertex, step
 from rimlight.transport.scattering import Numbers, Scattering
 from rimlight.transport.tracer import PathTracer
@@ -113,9 +114,9 @@ class Place:
 
         def surface(number, ray, pi):
             if number == 1:
-                return seen_by_camera(ray, pi, active, attached=scattering.attached)
+                return seen_by_camera(scattering.scene, ray, pi, active, attached=scattering.attached)
             with dr.resume_grad(when=scattering.attached):
-                return material_point(ray, pi, active, mi.RayFlags.All)
+                return surface_met(scattering.scene, ray, pi, FOLLOWS, active)
 
         si = surface(self.number, self.ray, self.pi)
         with dr.resume_grad(when=scattering.attached):

@@ -21,7 +21,7 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.cut_curves import cut_curves
-from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, vertices
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
@@ -111,13 +111,13 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below its "
             "cutoff_angle, and a projector an image with a black border."
         )
-    if any(is_mirror(s) for s in scene.shapes()) and (depths.scatters(2) or not from_points):
+    if any(is_mirror(s) for s in surfaces(scene)) and (depths.scatters(2) or not from_points):
         lacks = "outlines in the light that perfect mirrors and glass throw on other surfaces"
         lacks = lacks if from_points else "what perfect mirrors and glass show"
         limits.append(
             f'the derivative lacks the motion of {lacks}; give them a roughness, or set "sppi" to 0 to accept this.'
         )
-    through = names(s for s in scene.shapes() if lets_rays_through(s))
+    through = names(s for s in surfaces(scene) if lets_rays_through(s))
     if through and depths.scatters(2):
         limits.append(
             "the derivative lacks part of the motion of what is seen, and of what shines, through "
@@ -137,7 +137,7 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
     """What lacks of the jumps inside of surfaces and environments. bisects : are the lines of textures found?"""
     limits = []
     beams = [e for e in scene.emitters() if e.class_name() in BEAMS] if bisects else []
-    textures = jumping_textures(scene, besides=(*scene.shapes(), *beams) if bisects else ())
+    textures = jumping_textures(scene, besides=(*surfaces(scene), *beams) if bisects else ())
     if textures:
         limits.append(
             f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
@@ -154,7 +154,7 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
             f"{', '.join(mapped)} turn away from what they light."
         )
-    shown = depths.scatters(1) and any(is_mirror(s) for s in scene.shapes())
+    shown = depths.scatters(1) and any(is_mirror(s) for s in surfaces(scene))
     slides = moving.camera or moving.lights or (shown and moving.anything)
     if slides and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
         limits.append(
@@ -277,7 +277,7 @@ def coarse_lamps(scene: mi.Scene) -> list[str]:
 def coarse_meshes(scene: mi.Scene) -> list[str]:
     """What a derivative without `FacePlanes` lacks: the faces of smooth-shaded meshes hide light from themselves."""
     sized = [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Delta and not hasattr(e, "light_count")]
-    coarse = names(s for s in scene.shapes() if fringe(s) > FRINGE) if sized else []
+    coarse = names(s for s in surfaces(scene) if fringe(s) > FRINGE) if sized else []
     if not coarse:
         return []
     return [

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import collect_before
+from rimlight._plan import names
 from rimlight.edge_sampling import (
     Edges,
     FacePlanes,
@@ -29,7 +30,9 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.choice.light_choice import LightChoice
+from rimlight.edge_sampling.geometry.instances import Instances
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
+from rimlight.edge_sampling.geometry.meshes import inner, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
@@ -61,6 +64,7 @@ class BoundarySearch:
         self.who, self.depths, self.planes, self.from_points = who, depths, planes, from_points
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
+        self._instances = Instances()
         self._lines: Intersections | None = None
         self._sources: Sources | None = None
         self._checked = False
@@ -83,7 +87,7 @@ class BoundarySearch:
 
         sppi : samples per pixel of the boundaries at shading points.
         """
-        geometry, found = Geometry.of(scene), parameters(scene)
+        geometry, found = self._instances.geometry(scene), parameters(scene)
         self._renew(scene, found, geometry)
         with dr.resume_grad():
             self._media.refuse_gradients(self.who)
@@ -127,8 +131,8 @@ class BoundarySearch:
         self._lines = Intersections(scene, geometry, self.edges, weld)
         self._sources = Sources(scene, found, geometry, self.edges, weld)
         self._partial, self._media = PartialParameters(scene), Media(scene)
-        self._maps = [m for s in scene.shapes() for m in mapped_horizons(s)]
-        self._bent = [(s, o) for s in scene.shapes() for o in objects_below(s).values() if hasattr(o, "turns")]
+        self._maps = [m for s in surfaces(scene) for m in mapped_horizons(s)]
+        self._bent = [(s, o) for s in surfaces(scene) for o in objects_below(s).values() if hasattr(o, "turns")]
 
     def _find_lines(self, scene: mi.Scene) -> None:
         """Find the lines in which the meshes cut through each other now."""
@@ -175,7 +179,18 @@ class BoundarySearch:
 
     # ---------------------- Boundaries ----------------------
 
+    def _refuse_instances(self, moving: Moving) -> None:
+        """Refuse instances that move, and on which the jumps are not known that lie inside of faces."""
+        instances = [s for s in moving.shapes if inner(s) is not s]
+        jumps = names(s for s in instances if is_mirror(s) or len(TextureLines([inner(s)])))
+        if jumps:
+            raise Refusal(
+                f"{self.who}: instances {', '.join(jumps)} move, and are mirrors or glass, or their textures or bump "
+                "maps jump: where the jumps go is not known. Replace them by meshes."
+            )
+
     def _find(self, scene: mi.Scene, moving: Moving, sppi: int) -> Boundaries:
+        self._refuse_instances(moving)
         lights = Lights(scene)
         on_film = np.array([m or moving.camera for m in moving.flags], bool)
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
@@ -190,7 +205,7 @@ class BoundarySearch:
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights
-        mirrors = [s for s in scene.shapes() if is_mirror(s)] if self.from_points and self.depths.scatters(1) else []
+        mirrors = [s for s in surfaces(scene) if is_mirror(s)] if self.from_points and self.depths.scatters(1) else []
         mirrors = bool(mirrors), FineMirrors(mirrors) if mirrors else None
         textures = self._texture_lines(scene, moving, mirrors[0]) if self.from_points else None
         chains = (*mirrors, textures, Surfaces(scene) if mirrors[0] or textures else None)
@@ -200,7 +215,7 @@ class BoundarySearch:
     @staticmethod
     def _texture_lines(scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
         """The lines of textures, and of what lights throw, that move as seen from the camera, or in mirrors."""
-        shapes = scene.shapes() if mirrors else moving.with_lines
+        shapes = surfaces(scene) if mirrors else dict.fromkeys(inner(s) for s in moving.with_lines)
         everywhere = mirrors or moving.camera or moving.lights
         lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes)
         return lines if len(lines) else None
@@ -228,7 +243,9 @@ class BoundarySearch:
         (The camera alone moves neither.)"""
         planes = FacePlanes(scene)
         what_lights = moving.lights or (moving.shapes and self.depths.scatters(2))
-        return planes if planes.shapes and (what_lights or any(s in moving.shapes for s in planes.shapes)) else None
+        return (
+            planes if planes.shapes and (what_lights or any(inner(m) in planes.shapes for m in moving.shapes)) else None
+        )
 
     def _limits_of_sensor(self, sensor: mi.Sensor, moving: Moving) -> list[str]:
         """What the derivative will lack as seen from this sensor. Found once, since it looks at positions."""

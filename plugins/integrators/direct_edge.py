@@ -42,9 +42,9 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     light that moves takes its samples along (as in path-space differentiation, Zhang et al. 2020). So it needs no
     boundary unless something occludes it.
 
-    **Limits.** Only triangle meshes, spheres, disks and cylinders can move: a moving hair, instance, ... is refused,
+    **Limits.** Only triangle meshes and their instances, spheres, disks and cylinders can move: moving hair is refused,
     and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and
-    cylinders cut through other shapes, or the far clipping plane through any, and shadows of hair, instances, ... on
+    cylinders cut through other shapes, or the far clipping plane through any, and shadows of hair, ... on
     what moves. Warned about, too: jumps at T-junctions, which count twice, and participating
     media, which are taken for empty (derivatives with respect to their parameters are refused). So is the light of
     smooth-shaded lamps with coarse meshes, which is off by some per cent. Polarised variants are refused. With

@@ -13,6 +13,7 @@ from rimlight._collection import no_collection
 from rimlight._plan import Plan, names
 from rimlight.edge_sampling import Batch
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.geometry.instances import copied_places
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.order import TERMS
 from rimlight.terms.sampling import Counts
@@ -106,7 +107,7 @@ class EdgeIntegrator(ADIntegrator):
         mi.TensorXf, (H, W, C), linear radiance per unit of the parameter.
         """
         self._refuse_without_gradient(params)
-        with dr.suspend_grad():
+        with dr.suspend_grad(), copied_places(scene, dr.ADMode.Forward):
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Forward)
             job.boundaries.refit()
             terms, values = [], []
@@ -124,7 +125,7 @@ class EdgeIntegrator(ADIntegrator):
         """Add to the gradients of the parameters what `grad_in`, (H, W, C), the gradient of a loss with respect to the
         image, makes of them."""
         # Isolated, so that what lies behind the parameters is traversed once, and last: the sensor's share comes late.
-        with dr.isolate_grad(), dr.suspend_grad():
+        with dr.isolate_grad(), dr.suspend_grad(), copied_places(scene, dr.ADMode.Backward):
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Backward)
             job.boundaries.refit()
             terms = [make() for term, own in job.each for make in term.samples(own)]
@@ -266,7 +267,7 @@ class EdgeIntegrator(ADIntegrator):
         if dr.flag(dr.JitFlag.FreezingScope):
             raise Refusal(f"{self.name}: a frozen function cannot measure noise: call `balance` before it")
         self.shares = {}
-        with dr.suspend_grad():
+        with dr.suspend_grad(), copied_places(scene, dr.ADMode.Forward):
             jobs = [self.job(scene, sensor, seed + run, spp, dr.ADMode.Forward) for run in range(RUNS)]
             images = [self._images_of_terms(job) for job in jobs]
             plans = {term.name: term.planned(jobs[0]) for term in self.TERMS}

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from rimlight._collection import no_collection
 from rimlight.edge_sampling import FilmPart, Lights, stratified
+from rimlight.edge_sampling.geometry.instances import copied_places
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.sampling import in_a_row, over_film, seed_of
 from rimlight.terms.term import Job
@@ -150,7 +151,7 @@ class RigIntegrator(EdgeIntegrator):
         """
         if params is not None and not dr.grad_enabled(dict(params)):
             raise Refusal(f"{self.name}: none of the parameters carries a gradient")
-        with dr.suspend_grad():
+        with dr.suspend_grad(), copied_places(scene, dr.ADMode.Forward):
             image = self._differentiate(scene, sensor, seed, spp, None).image()
         report_image(self.name, image)
         return image
@@ -159,7 +160,7 @@ class RigIntegrator(EdgeIntegrator):
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Add to the gradients of the parameters what `grad_in`, (H, W, 3 K), the gradient of a loss with respect to
         the layers, makes of them."""
-        with dr.isolate_grad(), dr.suspend_grad():
+        with dr.isolate_grad(), dr.suspend_grad(), copied_places(scene, dr.ADMode.Backward):
             self._differentiate(scene, sensor, seed, spp, grad_in)
             dr.eval()
         report_gradients(self.name, params)

@@ -18,6 +18,7 @@ from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart
 from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
 from rimlight.edge_sampling.geometry.device_edges import BEHIND, BESIDE_LINE
+from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
@@ -171,7 +172,7 @@ class BisectionTerm(Term):
                 g = dr.select(at.grazes, dr.select(usable & at.grazes, dr.dot(moving.n, ray.d), 0), g)
             if line is not None:
                 on_line = usable & at.on_texture
-                si = at.a.pi.compute_surface_interaction(ray, mi.RayFlags.All, on_line)
+                si = surface_met(job.tracer.scene, ray, at.a.pi, mi.RayFlags.All, on_line)
                 g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, si), 0), g)
         return dr.select(usable, -segment.weight * along / total, 0), g
 
@@ -215,14 +216,15 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
         if chains.textures is not None:
             cells = (chains.textures.cell(chains.surfaces.met(x.ray, x.pi, wanted)) for x in (v, w))
             same = dr.select(at.on_texture, operator.eq(*cells), same)
-        usable &= (v.pi.shape == w.pi.shape) & same & (v.depth == w.depth)
+        usable &= (v.pi.shape == w.pi.shape) & (v.pi.instance == w.pi.instance) & same & (v.depth == w.depth)
     a, b = (dr.select(usable, new, old) for new, old in ((other.a, at.a), (other.b, at.b)))
     return replace(at, a=a, b=b)
 
 
 def _goes_on(vertex: Vertex) -> mi.Bool:
     """Does a mirror or glass reflect or refract the ray there?"""
-    flags = vertex.pi.shape.bsdf().flags()
+    si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.Minimal)
+    flags = si.bsdf().flags()
     return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
 
 

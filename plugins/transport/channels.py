@@ -122,7 +122,7 @@ class ChannelTracer(PathTracer):
         pi : what the rays meet, if that is known.
         """
         pi = self.first_hit(ray, active) if pi is None else pi
-        si = seen_by_camera(ray, pi, active, attached=attached)
+        si = seen_by_camera(self.scene, ray, pi, active, attached=attached)
         with dr.resume_grad(when=attached):
             valid = active & si.is_valid()
             found = []

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.geometry.meshes import surfaces
 from rimlight.edge_sampling.geometry.surfaces import components
 from rimlight.edge_sampling.rays import lift, spawn_ray
 
@@ -255,7 +256,7 @@ class Chains:
     def __init__(self, tracer: PathTracer, rays: FilmRays, boundaries: Boundaries):
         self.tracer, self.rays, self.surfaces = tracer, rays, boundaries.surfaces
         self.mirrors, self.textures = boundaries.mirrors, boundaries.textures
-        bsdfs = [s.bsdf().flags() for s in tracer.scene.shapes() if s.bsdf() is not None]
+        bsdfs = [s.bsdf().flags() for s in surfaces(tracer.scene) if s.bsdf() is not None]
         self._any_mask = self.mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
 
     def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:

@@ -56,7 +56,7 @@ class Chain:
             ray = mi.Ray3f(vertex.ray)
             ray.o, ray.d = dr.replace_grad(ray.o, o), dr.replace_grad(ray.d, d)
             far = self.vicinity.far(dr.square(vertex.pi.t))
-            si = sliding_point(ray, vertex.pi, dr.select(vertex.slides, 0, far), active)
+            si = sliding_point(self.scattering.scene, ray, vertex.pi, dr.select(vertex.slides, 0, far), active)
             if self.scattering.directional:
                 look_from(si, ray.o, ray, vertex.pi.t)
             return si
@@ -251,7 +251,7 @@ class MovingVertex:
 
     def _start(self, ray: mi.Ray3f) -> None:
         """The first vertex, and what moves the second."""
-        si = self.at_first = seen_by_camera(ray, self.first.pi, self.active, attached=True)
+        si = self.at_first = seen_by_camera(self.chain.scattering.scene, ray, self.first.pi, self.active, attached=True)
         active = self.active & (self._last > 1)
         second = self.log.vertex(dr.full(mi.UInt32, 2, dr.width(self.depth)), active)
         d = second.ray.d

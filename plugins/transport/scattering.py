@@ -10,7 +10,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
-from rimlight.edge_sampling.geometry.meshes import objects_below
+from rimlight.edge_sampling.geometry.meshes import objects_below, surfaces
 from rimlight.edge_sampling.parametrisation import Parametrisation, Vicinity, shown_by_mirror
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to_light
 
@@ -78,7 +78,7 @@ class Scattering:
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
         self.any_null = any(f & mi.BSDFFlags.Null for f in bsdfs)
-        self.by_density = [mi.BSDFPtr(s.bsdf()) for s in scene.shapes() if s.bsdf() and divides_by_density(s.bsdf())]
+        self.by_density = [mi.BSDFPtr(s.bsdf()) for s in surfaces(scene) if s.bsdf() and divides_by_density(s.bsdf())]
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in bsdfs)
@@ -241,7 +241,7 @@ class Scattering:
                         wrong |= bsdf == other
                     p = dr.detach(turned.pdf)
                     at_mirror *= dr.select(wrong & (p > 0), turned.pdf / dr.select(p > 0, p, 1), 1)
-                    y = dr.select(mirrored, shown_by_mirror(si, turned.wo, ray, pi, active & mirrored), y)
+                    y = dr.select(mirrored, shown_by_mirror(scene, si, turned.wo, ray, pi, active & mirrored), y)
                     attached, scattered = (dr.select(mirrored, at_mirror, x) for x in (attached, scattered))
                     if vicinity is not None:
                         d = dr.select(mirrored & active, si.to_world(turned.wo), ray.d)

@@ -86,7 +86,7 @@ class PathTracer:
         # ---------------------- First hit ----------------------
 
         pi = self.first_hit(ray, active) if pi is None else pi
-        si = seen_by_camera(ray, pi, active, attached=attached)
+        si = seen_by_camera(scene, ray, pi, active, attached=attached)
         if horizon is not None:
             turn_to_side(si, ray, horizon)
         if self.fine_mirrors is not None and not attached:
@@ -157,7 +157,7 @@ class PathTracer:
         pi = self.first_hit(ray, True)
         vertex = camera_vertex(ray, pi)
         if not self.scatters(2):
-            si, no = seen_by_camera(ray, pi, pi.is_valid(), attached=True), mi.Bool(False)
+            si, no = seen_by_camera(self.scene, ray, pi, pi.is_valid(), attached=True), mi.Bool(False)
             still = Vicinity(mi.Float(0))
             return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0)), None
         depths = replace(self.depths, max_depth=self.depths.max_depth - beyond)

@@ -35,6 +35,7 @@ NOTES = {
     "glass_index": "The same; the index of refraction changes.",
     "mirrored_ball": "What a mirrored ball shows, which moves.",
     "checkerboard": "The lines of a checkerboard, which turns.",
+    "chair_slides": "One of twenty instances of a chair, which slides.",
     "leaf": "The border of an opacity mask.",
     "beam_on_floor": "The border of a projector's picture, on a floor that moves.",
     "hidden_picture": "The same where it lights a wall by way of a floor; the projector moves.",

@@ -12,6 +12,7 @@ from building import CUBE_FACES, cube_vertices, diffuse, horizontal, mesh, quad,
 from random_scenes import ball, torus
 
 from rimlight.edge_sampling import Geometry, Intersections, find_welded_edges
+from rimlight.edge_sampling.geometry.rigid_motion import Shapes
 
 
 def intersections(scene: mi.Scene) -> tuple[Intersections, Geometry]:
@@ -109,6 +110,59 @@ def test_a_mesh_that_cuts_through_itself():
     lines, geometry = intersections(scene(both=both))
     one, other = np.split(corners(both), 2)
     assert length(pieces(lines, geometry)) == pytest.approx(by_all_pairs(one, other).sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.2, 2.5, 4.1])
+@pytest.mark.parametrize("meshes", [1, 2])
+def test_triangles_with_a_corner_in_common(turn, meshes):
+    """Two triangles with a corner in the origin, of which the second goes through the first, from y > 0 to y < 0."""
+    triangles = np.array([[[0, 0, 0], [1, 0, -0.5], [1, 0, 0.5]], [[0, 0, 0], [0.7, 0.4, 0.1], [0.6, -0.5, 0]]])
+    (_, a, b), t = triangles[1], 0.4 / 0.9
+    end = (1 - t) * a + t * b
+    c, s = np.cos(turn), np.sin(turn)
+    triangles = triangles @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    faces = np.arange(6 // meshes).reshape(-1, 3)
+    shapes = [mesh(f"m{k}", p, faces, bsdf=diffuse(0.5)) for k, p in enumerate(triangles.reshape(meshes, -1, 3))]
+    found = pieces(*intersections(scene(**{m.id(): m for m in shapes})))
+    assert len(found) == 1
+    assert length(found) == pytest.approx(np.linalg.norm(end), rel=1e-5)
+    assert np.linalg.norm(found, axis=2).min() < 1e-6  # it begins in the corner
+
+
+def test_a_mesh_that_comes_to_cut_through_itself():
+    vertices = np.concatenate([cube_vertices(), np.add(cube_vertices(), [2.5, 0.3, 0.2])])
+    there = scene(both=mesh("both", vertices, [*CUBE_FACES, *(np.array(CUBE_FACES) + 8)], bsdf=diffuse(0.5)))
+    lines, geometry = intersections(there)
+    assert lines.capacity == 0
+    params = mi.traverse(there)
+    for shift, cuts in ((2.0, True), (0.0, False)):
+        moved = vertices - np.repeat([[0, 0, 0], [shift, 0, 0]], 8, 0)
+        params["both.vertex_positions"] = mi.Float(moved.astype(np.float32).ravel())
+        params.update()
+        lines.find(there, geometry)
+        one, other = np.split(corners(geometry.meshes[0]), 2)
+        assert length(pieces(lines, geometry)) == pytest.approx(by_all_pairs(one, other).sum(), rel=1e-4)
+        assert (lines.count > 0) == cuts
+        assert lines.meshes == ((0,) if cuts else ())
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_which_meshes_change_their_shapes(flat):
+    vertices, _, _, faces = ball(6)
+    vertices = vertices * [1, 1, 0] if flat else vertices
+    geometry = Geometry.of(scene(ball=mesh("ball", vertices, faces, bsdf=diffuse(0.5))))
+    shapes = Shapes(geometry)
+    array = lambda v: [mi.Float(v.astype(np.float32).ravel())]
+    assert shapes.changed(array(vertices)) == {0}
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    for moved in (vertices, np.add(vertices, [10, 0, 3]), vertices @ turn, np.add(0.3 * vertices @ turn, [1, 2, 3])):
+        assert shapes.changed(array(moved)) == set()
+    for k in range(len(vertices)):
+        bent = vertices.copy()
+        bent[k, 2] += 1e-4
+        assert shapes.changed(array(bent)) == {0}
+        assert shapes.changed(array(vertices)) == {0}
 
 
 def test_lines_follow_the_planes_of_both_meshes():

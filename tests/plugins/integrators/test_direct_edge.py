@@ -225,8 +225,8 @@ def moving(scene, key, **motion):
     return derivative_image(scene, integrator(), Motion(scene, key, **motion), spp=4)
 
 
-def test_instances_must_stand_still():
-    group = {"type": "shapegroup", "inner": cases.smooth_cube()}
+def test_instances_of_other_shapes_than_meshes_must_stand_still():
+    group = {"type": "shapegroup", "inner": cases.smooth_cube(), "other": {"type": "sphere"}}
     scene = cases.scene(
         sensor=cases.camera(),
         group=group,

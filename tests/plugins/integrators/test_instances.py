@@ -1,0 +1,106 @@
+"""Derivatives of instances. Their references are in `test_derivatives.py`."""
+
+from __future__ import annotations
+
+import building
+import drjit as dr
+import instances
+import mitsuba as mi
+import numpy as np
+import pytest
+from frozen import assert_frozen_is_unfrozen
+
+from rimlight.checks import Motion, derivative_image
+
+INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 3}}
+
+
+def forward(scene: mi.Scene, made: mi.Integrator, spp: int = 32, **motion) -> np.ndarray:
+    return np.array(derivative_image(scene, made, Motion(scene, **motion), spp=spp, seed=3), float)
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_gradients_are_those_of_forward_mode(name):
+    scene, made = instances.stretched_ball(), mi.load_dict(INTEGRATORS[name])
+    motion = Motion(scene, "thing.to_world", rotate=[0.3, 1, 0.2])
+    expected = np.array(derivative_image(scene, made, motion, spp=16, seed=3), float)
+    weight = np.random.default_rng(0).uniform(0.5, 1, expected.shape)
+    θ = mi.Float(0)
+    dr.enable_grad(θ)
+    motion.apply(θ)
+    made.render_backward(scene, motion.params, mi.TensorXf(weight.astype(np.float32)), seed=3, spp=16)
+    dr.enqueue(dr.ADMode.Backward, θ)
+    dr.traverse(dr.ADMode.Backward)
+    assert abs(dr.grad(θ)[0] - (weight * expected).sum()) < 1e-3 * np.abs(weight * expected).sum()
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+@pytest.mark.parametrize("key", ["thing.to_world", "floor.vertex_positions"])
+def test_frozen_functions(name, key):
+    assert_frozen_is_unfrozen(instances.stretched_ball(), mi.load_dict(INTEGRATORS[name]), key)
+
+
+def assert_equal(key: str, motion: dict, *others: str) -> None:
+    """The derivative of instances is the sum of those of meshes, but for other random numbers."""
+    made = mi.load_dict(INTEGRATORS["direct_edge"])
+    a = forward(instances.boxes(), made, 128, key=key, **motion)
+    assert not made.search.geometry.others
+    apart = instances.boxes(apart=True)
+    b = sum(forward(apart, mi.load_dict(INTEGRATORS["direct_edge"]), 128, key=k, **motion) for k in others or (key,))
+    assert (a * b).sum() / (b * b).sum() == pytest.approx(1, abs=0.02)
+    assert np.abs(a - b).sum() < 0.15 * np.abs(b).sum()  # noise: 0.05 to 0.12
+
+
+@pytest.mark.parametrize("key", ["board.vertex_positions", "sensor.to_world", "lamp.vertex_positions"])
+def test_instances_that_stand_still_equal_meshes(key):
+    """In what the camera sees, and in the shadows; of reflected and stretched ones, too."""
+    assert_equal(key, {"direction": [1, 0.3, 0.2]})
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_instances_that_move_equal_meshes(k):
+    motion = {"rotate": [0.3, 1, 0.2], "pivot": [k - 1, 0.45, 0.3 * k]}
+    assert_equal(f"box{k}.to_world", motion, *(f"box{k}{name}.vertex_positions" for name in "ab"))
+
+
+def test_the_plan_names_the_instance_that_moves():
+    scene = instances.boxes()
+    params = mi.traverse(scene)
+    place = mi.AffineTransform4f(params["box1.to_world"])
+    dr.enable_grad(place)
+    params["box1.to_world"] = place
+    params.update()
+    plan = mi.load_dict(INTEGRATORS["direct_edge"]).plan(scene)
+    assert set(plan.moving) == {'"box1"'}
+    assert not plan.limits
+
+
+def test_lines_in_which_an_instance_cuts_through_a_mesh():
+    """Of the second mesh in a group, too."""
+    found = []
+    for apart in (False, True):
+        scene, made = instances.boxes(apart=apart), mi.load_dict(INTEGRATORS["direct_edge"])
+        params = mi.traverse(scene)
+        params["board.vertex_positions"] = params["board.vertex_positions"] + mi.Float([-1.1, 0.3, 1.1] * 8)
+        params.update()
+        forward(scene, made, 1, key="board.vertex_positions", direction=[1, 0, 0])
+        found.append((made.search._lines, made.search.geometry))
+    lengths = []
+    for lines, geometry in found:
+        lower, upper, *_ = lines.points(geometry.positions())
+        lengths.append(dr.sum(dr.norm(upper - lower))[0])
+    assert found[0][0].count == found[1][0].count > 8
+    assert lengths[0] == pytest.approx(lengths[1], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [{"type": "conductor"}, {"type": "diffuse", "reflectance": {"type": "checkerboard"}}],
+    ids=lambda b: b["type"],
+)
+def test_jumps_inside_of_faces_are_refused(bsdf):
+    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": bsdf}}
+    thing = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    scene = building.scene(sensor=building.camera(), group=group, thing=thing, **instances.room())
+    with pytest.raises(RuntimeError, match='instances "thing" move, and are mirrors'):
+        forward(scene, mi.load_dict(INTEGRATORS["direct_edge"]), 1, key="thing.to_world", direction=[1, 0, 0])
