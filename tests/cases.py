@@ -29,6 +29,7 @@ from building import (
     scene,
 )
 from cuts import CUTS
+from hidden_lights import HIDDEN
 from mirrors import MIRRORS, ball_of_index
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
@@ -54,6 +55,7 @@ class Case:
     reference_spp : samples per pixel of each image of the finite differences; a square number.
     needs : a file outside of the project without which there is no scene.
     reference_scene : makes another scene that has the same derivative, where images of Mitsuba's `path` are right.
+    reference_images : which integrator makes the images of the finite differences.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Case:
     reference_spp: int = 16384
     needs: Path | None = None
     reference_scene: Callable[[], mi.Scene] | None = None
+    reference_images: str = "path"
 
     @property
     def max_depth(self) -> int:
@@ -128,6 +131,10 @@ def messages() -> Iterator[list[str]]:
 
 
 # ---------------------- Building blocks ----------------------
+
+
+def bdpt_edge(max_depth: int) -> dict[str, Any]:
+    return {"type": "bdpt_edge", "max_depth": max_depth}
 
 
 def prb_edge(max_depth: int, **samples: int) -> dict:
@@ -899,6 +906,10 @@ CASES = [
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096)
         for k, (*of, depth) in (CUTS | MIRRORS | BEAMS).items()
+    ),
+    *(
+        Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
+        for k, of in HIDDEN.items()
     ),
 ]
 
