@@ -50,8 +50,9 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
        - Hide directly visible emitters. (Default: no)
 
     Renders what ``bdpt`` renders, and differentiates it with respect to what ``prb_edge`` differentiates. Use it where
-    light is hard to find from the camera: in the derivative of caustics, and of rooms whose lamps are in shades or
-    behind doors. In the open, ``prb_edge`` takes about half of its time for the same noise.
+    light is hard to find from the camera, such as caustics and the light of lamps in shades or behind doors, and where
+    what changes are materials and lamps. If what hides the light moves, most of the noise is at boundaries, which it
+    shares with ``prb_edge``. In the open, ``prb_edge`` takes about half of its time for the same noise.
 
     **Interior.** Each camera path and each light path keeps one of the paths that were made of it, in proportion to its
     light, and differentiates this path alone, from its light to the camera. Vertices are held as in ``prb_edge``,
