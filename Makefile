@@ -39,7 +39,7 @@ mutants: setup
 	$(BIN)/python tests/mutants.py
 
 # All of them take about three quarters of an hour; or one: make bench NAME=scaling
-NAME ?= film_boundary soft_shadow hard_shadow every_jump depth_map glossy global_illumination scaling rig bidirectional integration reflectance photometric_stereo single_image
+NAME ?= film_boundary soft_shadow hard_shadow every_jump depth_map glossy global_illumination scaling rig bidirectional bidirectional_derivatives integration reflectance photometric_stereo single_image
 bench: setup
 	for name in $(NAME); do $(BIN)/python tests/benchmarks/bm_$$name.py || exit 1; done
 

@@ -29,6 +29,7 @@ from building import (
     scene,
 )
 from cuts import CUTS
+from hidden_lights import HIDDEN
 from instances import INSTANCES
 from mirrors import MIRRORS, ball_of_index
 from random_scenes import ball
@@ -55,6 +56,7 @@ class Case:
     reference_spp : samples per pixel of each image of the finite differences; a square number.
     needs : a file outside of the project without which there is no scene.
     reference_scene : makes another scene that has the same derivative, where images of Mitsuba's `path` are right.
+    reference_images : which integrator makes the images of the finite differences.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Case:
     reference_spp: int = 16384
     needs: Path | None = None
     reference_scene: Callable[[], mi.Scene] | None = None
+    reference_images: str = "path"
 
     @property
     def max_depth(self) -> int:
@@ -129,6 +132,10 @@ def messages() -> Iterator[list[str]]:
 
 
 # ---------------------- Building blocks ----------------------
+
+
+def bdpt_edge(max_depth: int) -> dict[str, Any]:
+    return {"type": "bdpt_edge", "max_depth": max_depth}
 
 
 def prb_edge(max_depth: int, **samples: int) -> dict:
@@ -904,6 +911,10 @@ CASES = [
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k == "chair_slides" else 1024)
         for k, (*of, depth) in INSTANCES.items()
+    ),
+    *(
+        Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
+        for k, of in HIDDEN.items()
     ),
 ]
 

@@ -26,7 +26,7 @@ MORE_CASES = (
     "led_moves distant_cube discs_lights discs_radius smooth_torus_sun sphere_sun sphere_light surroundings "
     "reflecting_ball light_out_of_frame sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
     "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
-    "hidden_picture box_behind_glass spike stretched_ball"
+    "hidden_picture box_behind_glass spike stretched_ball lampshade_wall"
 )
 
 #: Slow tests, by how their names begin.
@@ -78,6 +78,16 @@ test_bdpt.py::test_surfaces[plastic
 test_bdpt.py::test_surfaces[principled
 test_bdpt.py::test_surfaces[rough plastic
 test_bdpt.py::test_surfaces[thin glass
+test_bdpt_edge.py::test_any_number_of_light_paths[0.1
+test_bdpt_edge.py::test_any_number_of_light_paths[2.0
+test_bdpt_edge.py::test_both_modes[caustic_lamp
+test_bdpt_edge.py::test_both_modes[cornell_box_camera
+test_bdpt_edge.py::test_both_modes[veil_and_mirror
+test_bdpt_edge.py::test_frozen[<lambda>
+test_bdpt_edge.py::test_interior_is_that_of_path_replay[ball_on_floor
+test_bdpt_edge.py::test_interior_is_that_of_path_replay[mirrored_sphere
+test_bdpt_edge.py::test_interior_is_that_of_path_replay[rough_panes
+test_bdpt_edge.py::test_interior_is_that_of_path_replay[spot_behind_screen
 test_blinn_phong.py::test_shadows_and_reflections_move
 test_blinn_phong.py::test_textures_in_a_render[diffuse_reflectance-direct_edge]
 test_blinn_phong.py::test_textures_in_a_render[roughness-prb_edge]

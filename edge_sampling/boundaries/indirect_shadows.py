@@ -30,8 +30,8 @@ from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow, ShadowBoun
 from .tracer import ShadingPoint, Tracer
 
 #: Shadows in the light of lamps of which one is kept, in proportion to what it contributes if nothing hides it. In that
-#: of lights without size, one is taken as it comes: the borders of a shadow mostly contribute with opposite signs, and a
-#: stratified choice leaves less of them by chance than a choice by size.
+#: of lights without size, one is taken as it comes: the borders of a shadow mostly contribute with opposite signs, and
+#: a stratified choice leaves less of them by chance than a choice by size.
 CANDIDATES = 2
 
 #: What the estimated density of edges, as they are found from lamps, is divided by: see `share`.

@@ -121,10 +121,18 @@ def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sen
     """Render with the `multijitter` sampler, whichever the sensor has: (H, W, C), linear radiance, double precision.
 
     integrator : a sampling integrator of Mitsuba (`path`, `direct`, `aov`, ...). Of one with channels besides light
-        (`aov_names`), these alone are returned, without an image of light.
+        (`aov_names`), these alone are returned, without an image of light. `bdpt`, whose paths do not all start at the
+        camera, takes the sensor's own sampler.
     """
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
+    if type(integrator).__name__ == "BDPTIntegrator":
+        passes = next(n for n in range(-(-spp // PASS), spp + 1) if spp % n == 0)
+        images = [
+            np.array(integrator.render(scene, sensor, seed * passes + i, spp // passes), np.float64)
+            for i in range(passes)
+        ]
+        return np.mean(images, axis=0)
     film = sensor.film()
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
     spp = sampler.sample_count()

@@ -7,6 +7,8 @@ import math
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.transport.found_light import Seen
+
 #: Points at which a reconstruction filter is looked at along each pixel.
 POINTS = 32
 
@@ -28,11 +30,15 @@ class LightImage:
         self.block.set_coalesce(False)
         self.has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
 
-    def add(self, u: mi.Point2f, L: mi.Spectrum, active: mi.Bool) -> None:
-        """u : mi.Point2f, (N,), pixels. L : mi.Spectrum, (N,), so that the mean over all samples of the film is the
-        radiance."""
+    def nothing(self, count: int) -> tuple:
+        """What `add` returns: all is in the image."""
+        return ()
+
+    def add(self, known: tuple, seen: Seen, L: mi.Spectrum, sampler: mi.Sampler, active: mi.Bool) -> tuple:
+        """L : mi.Spectrum, (N,), so that the mean over all samples of the film is the radiance."""
         colour = [L.x, L.x, L.x] if mi.is_monochromatic else [L.x, L.y, L.z]
-        self.block.put(u, [*colour, *([mi.Float(0)] if self.has_alpha else []), mi.Float(0)], active)
+        self.block.put(seen.u, [*colour, *([mi.Float(0)] if self.has_alpha else []), mi.Float(0)], active)
+        return known
 
     def add_to(self, camera: mi.ImageBlock) -> None:
         """Put both images on the film. camera : the block of the camera's samples."""

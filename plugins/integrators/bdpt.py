@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
-from rimlight._collection import no_collection
 from rimlight.edge_sampling.refusals import InputError, Refusal
-from rimlight.terms.sampling import in_a_row, seed_of
-from rimlight.transport.bidirectional import CameraPaths
-from rimlight.transport.emission import Emission
-from rimlight.transport.film_views import FilmViews
-from rimlight.transport.light_subpaths import LightSubpaths, Ways
 from rimlight.transport.paths import Depths
-from rimlight.transport.tracer import PathTracer
 
-from ._light_image import LightImage
-from ._limits import Media
+from ._bidirectional_image import light_paths_of, render
 from ._options import check_options, is_whole
 
 
@@ -64,7 +55,7 @@ class BDPTIntegrator(ADIntegrator):
     ``perspective``, ``thinlens``, ``orthographic`` and ``fisheye`` sensors, and batches of them. All other sensors see
     their light by connections with camera paths alone.
 
-    **Limits.** There is no derivative: use ``prb_edge``. Participating media, spectral and polarised variants are
+    **Limits.** There is no derivative: use ``bdpt_edge``. Participating media, spectral and polarised variants are
     refused. In the open, it takes about twice the time of ``path`` for the same noise.
 
     In Python, the attribute ``ways`` selects what is rendered: ``integrator.ways = (s, t)`` are the paths of s vertices
@@ -90,26 +81,19 @@ class BDPTIntegrator(ADIntegrator):
         check_options(props, self.OPTIONS)
         self.name = props.plugin_name()
         max_depth, rr_depth = props.get("max_depth", 6), props.get("rr_depth", 5)
-        light_paths, per_pass = props.get("light_paths", 0.5), props.get("spp_per_pass", None)
+        per_pass = props.get("spp_per_pass", None)
         if not is_whole(max_depth) or max_depth < -1:
             raise InputError(
                 f'{self.name}: "max_depth" must be a whole number >= 0, or -1 for no limit, got {max_depth}'
             )
         if not is_whole(rr_depth) or rr_depth < 1:
             raise InputError(f'{self.name}: "rr_depth" must be a whole number >= 1, got {rr_depth}')
-        if isinstance(light_paths, bool) or not isinstance(light_paths, int | float) or not 0 < light_paths <= 16:
-            raise InputError(f'{self.name}: "light_paths" must be a number above 0 and up to 16, got {light_paths}')
         if per_pass is not None and (not is_whole(per_pass) or per_pass < 1):
             raise InputError(f'{self.name}: "spp_per_pass" must be a whole number >= 1, got {per_pass}')
-        if mi.is_polarized or mi.is_spectral:
-            kind = "polarised" if mi.is_polarized else "spectral"
-            raise InputError(
-                f"{self.name}: {kind} variants are not supported, got {mi.variant()}: set an rgb or mono variant, or "
-                "use Mitsuba's path"
-            )
+        self.light_paths = light_paths_of(props)
         super().__init__(props)
         self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
-        self.light_paths, self.per_pass = float(light_paths), per_pass
+        self.per_pass = per_pass
         #: Numbers of vertices from the light and from the camera of the paths that are rendered; None: any.
         self.ways: tuple[int | None, int | None] = (None, None)
 
@@ -119,7 +103,6 @@ class BDPTIntegrator(ADIntegrator):
 
     # ---------------------- Mitsuba's interface ----------------------
 
-    @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The image, as Mitsuba has it.
 
@@ -127,68 +110,15 @@ class BDPTIntegrator(ADIntegrator):
         ------
         RuntimeError : there are participating media, or the passes do not add up to the samples per pixel.
         """
-        if not develop:
-            raise Refusal(f"{self.name}: images are developed; leave develop=False out")
-        if Media(scene).found:
-            raise Refusal(f"{self.name}: participating media are not supported: remove them, or use Mitsuba's volpath")
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        with dr.suspend_grad():
-            sampler, spp = self.prepare(sensor, seed, spp, [])
-            per_pass = min(self.per_pass or spp, spp)
-            if spp % per_pass:
-                raise Refusal(f'{self.name}: "spp_per_pass", {per_pass}, must divide the {spp} samples per pixel')
-            film = sensor.film()
-            light, block = LightImage(film, spp), film.create_block()
-            block.set_coalesce(block.coalesce() and per_pass >= 4)
-            pixels = sampler.wavefront_size() // spp
-            for i in range(spp // per_pass):
-                if per_pass < spp:
-                    sampler = _of_pass(sampler, seed_of("passes", seed, i), per_pass, pixels)
-                lights = max(1, round(pixels * per_pass * self.light_paths))
-                self._trace(
-                    scene, sensor, sampler, in_a_row(sensor, seed_of("light paths", seed, i), lights), light, block
-                )
-                if per_pass < spp:
-                    dr.eval(block.tensor(), light.block.tensor())
-            light.add_to(block)
-            return film.develop()
-
-    def _trace(self, scene, sensor, sampler, light_sampler, light: LightImage, block: mi.ImageBlock) -> None:
-        """Add samples to the images of light subpaths and of camera paths."""
-        film = sensor.film()
-        count, lights = sampler.wavefront_size(), light_sampler.wavefront_size()
-        emission, ways = Emission(scene), Ways.of(*self.ways)
-        views = FilmViews(sensor, count // sampler.sample_count(), lights / count)
-        subpaths = LightSubpaths(scene, emission, self.depths, ways, hide_emitters=self.hide_emitters)
-        # All samples of a wavefront happen at one time: nothing in Mitsuba moves.
-        vertices = subpaths.trace(light_sampler, lights, sensor.shutter_open(), views, light.add)
-        ray, ray_weight, u = self.sample_rays(scene, sensor, sampler)
-        pi = PathTracer(scene, self).first_hit(ray, True)
-        camera = CameraPaths(scene, emission, self.depths, ways, hide_emitters=self.hide_emitters)
-        L, valid = camera.radiance(ray, pi, u, sampler, views, vertices)
-        alpha = dr.select(valid, mi.Float(1), 0)
-        ADIntegrator._splat_to_block(block, film, u, L * ray_weight, 1.0, alpha, [], ray.wavelengths)
+        return render(self, scene, sensor, seed, spp, develop, per_pass=self.per_pass, ways=self.ways)
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         """Not supported."""
-        raise Refusal(f"{self.name}: has no derivative, use prb_edge")
+        raise Refusal(f"{self.name}: has no derivative, use bdpt_edge")
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Not supported."""
-        raise Refusal(f"{self.name}: has no derivative, use prb_edge")
-
-
-def _of_pass(sampler: mi.Sampler, seed: int | mi.UInt32, spp: int, pixels: int) -> mi.Sampler:
-    sampler = sampler.clone()
-    sampler.set_sample_count(spp)
-    if sampler.sample_count() != spp:
-        raise Refusal(
-            f'bdpt: the sampler takes {sampler.sample_count()} samples per pixel for the {spp} of "spp_per_pass": '
-            "set that number"
-        )
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(seed, pixels * spp)
-    return sampler
+        raise Refusal(f"{self.name}: has no derivative, use bdpt_edge")
 
 
 mi.register_integrator("bdpt", BDPTIntegrator)

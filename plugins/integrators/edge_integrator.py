@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -142,9 +143,11 @@ class EdgeIntegrator(ADIntegrator):
                 # loses what it gives to one mesh where another one has interpolated normals.
                 # Those that are cut are not traversed with others: at what lies behind these, Dr.Jit evaluates all, but
                 # the gradients at the cuts, which would then trace all rays again.
-                (first, *others) = zip(terms, values, strict=True)
+                pairs = list(zip(terms, values, strict=True))
+                alone = [[pair] for i, pair in enumerate(pairs) if i == 0 or pair[0].replay is not None]
+                others = [pair for i, pair in enumerate(pairs) if i > 0 and pair[0].replay is None]
                 cut, whole = ([pair for pair in others if bool(pair[0].cuts) == is_cut] for is_cut in (True, False))
-                for group in ([first], cut, whole):
+                for group in (*alone, cut, whole):
                     for term, value in group:
                         gradient = dr.grad(value)
                         if term.replay is not None:
@@ -314,11 +317,15 @@ class EdgeIntegrator(ADIntegrator):
 
     def _boundaries(self, scene, sensor, sppi, find=None) -> Boundaries:
         boundaries = (find or self.search.boundaries)(scene, sensor, sppi)
-        for message in boundaries.limits:
+        self._warn(boundaries.limits)
+        return boundaries
+
+    def _warn(self, limits: Sequence[str]) -> None:
+        """Say what a derivative lacks, once."""
+        for message in limits:
             if message not in self._warned:
                 self._warned.add(message)
                 mi.Log(mi.LogLevel.Warn, f"{self.name}: {message}")
-        return boundaries
 
     def _counts(self, sensor: mi.Sensor, spp: int) -> Counts:
         return Counts.of(self.sppc, self.sppp, self.sppi, spp, sensor)

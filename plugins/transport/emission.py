@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.rays import spawn_ray
 
+from .found_light import LightEnd
 from .subpath_weights import Shorter
 
 #: Rays by which the power of a light without size is estimated, for weights only.
@@ -30,15 +31,32 @@ class LightSample:
     arrival: mi.Float
 
 
+class Around:
+    """A sphere around a scene, as large as Mitsuba's, or a little larger."""
+
+    DRJIT_STRUCT = dict.fromkeys(("centre", "radius"))  # for `dr.freeze`
+
+    def __init__(self, scene: mi.Scene):
+        box = scene.bbox()
+        sphere = box.bounding_sphere() if box.valid() else None
+        self.centre = mi.Point3f(sphere.center if sphere else 0)
+        # Rays start outside of everything that they may meet.
+        radius = sphere.radius * (1 + 2 * mi.math.RayEpsilon) if sphere else 0
+        self.radius = mi.Float(max(radius, mi.math.RayEpsilon))
+        dr.make_opaque(self.centre, self.radius)
+
+
 class Emission:
     """The lights of a scene, as the first vertices of paths.
+
+    around : the scene; None: it is looked at.
 
     Emitters at infinity shine through a disc that is as large as the scene's bounding sphere. (Rays are not sampled by
     Mitsuba's `Emitter.sample_ray`, which `envmap` of Mitsuba 3.9 gets wrong if it is turned.)
     """
 
-    def __init__(self, scene: mi.Scene):
-        self.scene = scene
+    def __init__(self, scene: mi.Scene, around: Around | None = None):
+        self.scene, around = scene, around or Around(scene)
         emitters = scene.emitters()
         flags = [e.flags() for e in emitters]
         self.any = bool(emitters)
@@ -49,13 +67,7 @@ class Emission:
         self.any_textured = any(f & mi.EmitterFlags.SpatiallyVarying and self._shines_from_area(f) for f in flags)
         total = sum(e.sampling_weight() for e in emitters)
         self.per_weight = 1 / total if total > 0 else 0.0
-        box = scene.bbox()
-        sphere = box.bounding_sphere() if box.valid() else None
-        self.centre = mi.Point3f(sphere.center if sphere else 0)
-        # Rays start outside of everything that they may meet.
-        radius = sphere.radius * (1 + 2 * mi.math.RayEpsilon) if sphere else 0
-        self.radius = mi.Float(max(radius, mi.math.RayEpsilon))
-        dr.make_opaque(self.centre, self.radius)
+        self.centre, self.radius = around.centre, around.radius
         self.power = self._powers() if self.any_point else None
 
     @staticmethod
@@ -123,9 +135,9 @@ class Emission:
 
     def start(
         self, sampler: mi.Sampler, time: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Spectrum, Shorter]:
-        """Rays from the lights, what they meet, their power over its density, and the weights of what they meet before
-        it is known where that is."""
+    ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Spectrum, Shorter, LightEnd]:
+        """Rays from the lights, what they meet, their power over its density, the weights of what they meet before it
+        is known where that is, and where they start."""
         scene = self.scene
         index, over_p, left = scene.sample_emitter(sampler.next_1d(active), active)
         first, second = sampler.next_2d(active), sampler.next_2d(active)
@@ -136,6 +148,7 @@ class Emission:
         ray, β = dr.zeros(mi.Ray3f, n), dr.zeros(mi.Spectrum, n)
         ray.d = mi.Vector3f(0, 0, 1)
         ds, connects = dr.zeros(mi.DirectionSample3f, n), mi.Bool(False)
+        end = LightEnd(dr.zeros(mi.Point3f, n), emitter)
         if self.any_infinite:
             mine = active & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             at = dr.zeros(mi.Interaction3f, n)
@@ -146,6 +159,7 @@ class Emission:
             made = mi.Ray3f(mi.Point3f(self.centre + self.radius * across), -found.d)
             ray, ds = dr.select(mine, made, ray), dr.select(mine, found, ds)
             β = dr.select(mine, value * (dr.pi * dr.square(self.radius)), β)
+            end.place = dr.select(mine, mi.Point3f(found.d), end.place)
             connects |= mine
         if self.any_area:
             surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
@@ -155,6 +169,7 @@ class Emission:
             at.wi = mi.warp.square_to_cosine_hemisphere(second)
             made = spawn_ray(scene, at, at.to_world(at.wi))
             ray = dr.select(mine, mi.Ray3f(made.o, made.d), ray)
+            end.place = dr.select(mine, found.p, end.place)
             found = mi.DirectionSample3f(found)
             found.d, found.dist, found.emitter = -made.d, mi.Float(0), emitter
             ds = dr.select(mine, found, ds)
@@ -166,13 +181,15 @@ class Emission:
             mine &= point | mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
             made, value = emitter.sample_ray(time, left, first, second, mine)
             ray, β = dr.select(mine, mi.Ray3f(made.o, made.d), ray), dr.select(mine, value, β)
+            end.place = dr.select(mine, made.o, end.place)
             ds.delta |= mine & point
             connects |= mine & point
         ray.time = time
         β *= over_p
         active = active & dr.any(β != 0)
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        return ray, pi, dr.select(active, β, 0), self._first(ray, pi, ds, emitter, index, p, active & connects)
+        first = self._first(ray, pi, ds, emitter, index, p, active & connects)
+        return ray, pi, dr.select(active, β, 0), first, end
 
     def _first(self, ray, pi, ds, emitter, index, p, active) -> Shorter:
         """Of the first vertex: 0 where neither a light sample nor a ray in the opposite direction finds the light."""

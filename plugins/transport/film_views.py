@@ -48,6 +48,13 @@ class FilmViews:
         #: Can points be projected on to the film?
         self.projects = bool(self.projections)
 
+    @staticmethod
+    def none() -> FilmViews:
+        """Those of a sensor that sees no point."""
+        views = FilmViews.__new__(FilmViews)
+        views.parts, views.projections, views.projects, views.needs_aperture = [], [], False, False
+        return views
+
     def of(self, p: mi.Point3f, lens: mi.Point2f, choice: mi.Float, active: mi.Bool) -> View:
         """Views of points: p, (N,), world space. lens : random numbers for a point of the lens. choice : of a part."""
         number = dr.minimum(mi.UInt32(choice * len(self.parts)), len(self.parts) - 1)

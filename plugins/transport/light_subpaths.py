@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -12,11 +12,20 @@ from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
 
 from .emission import Emission
 from .film_views import FilmViews
+from .found_light import LightEnd, Seen
 from .paths import Depths
 from .subpath_weights import Shorter, weight
+from .vertex_table import VertexTable
 
-#: Takes what the sensor sees of light subpaths: film positions in pixels, radiance, and where there is something.
-Splat = Callable[[mi.Point2f, mi.Spectrum, mi.Bool], None]
+
+class Film(Protocol):
+    """Takes what the sensor sees of light subpaths."""
+
+    def nothing(self, count: int) -> Any:
+        """What is known before any light is seen, of so many subpaths: a PyTree."""
+
+    def add(self, known: Any, seen: Seen, L: mi.Spectrum, sampler: mi.Sampler, active: mi.Bool) -> Any:
+        """What is known then. L : mi.Spectrum, (N,), so that the mean over all samples of the film is the radiance."""
 
 
 @dataclass
@@ -122,32 +131,39 @@ class LightSubpaths:
         self.scene, self.emission, self.depths, self.ways = scene, emission, depths, ways
         self.hides = hide_emitters and emission.any_area
 
-    def trace(self, sampler: mi.Sampler, count: int, time: mi.Float, views: FilmViews, splat: Splat) -> LightVertex:
-        """Trace them, and hand what the sensor sees of each vertex to `splat`: film position, radiance, and where there
-        is something.
+    def trace(
+        self,
+        sampler: mi.Sampler,
+        count: int,
+        time: mi.Float,
+        views: FilmViews,
+        film: Film,
+        table: VertexTable | None = None,
+    ) -> tuple[LightVertex, LightEnd | None, Any]:
+        """Trace them, and hand what the sensor sees of each vertex to `film`. table : for all vertices.
 
         Returns
         -------
-        One vertex of each subpath.
+        One vertex of each subpath; where it starts, None if there is no light; and what `film` knows at last.
         """
-        kept = dr.zeros(LightVertex, count)
+        kept, known = dr.zeros(LightVertex, count), film.nothing(count)
         if not self.emission.any or not self.depths.scatters(1):
-            return kept
+            return kept, None, known
         lane = dr.arange(mi.UInt32, count)
         active = dr.full(mi.Bool, True, count)
-        ray, pi, β, shorter = self.emission.start(sampler, time, active)
+        ray, pi, β, shorter, end = self.emission.start(sampler, time, active)
         start = dr.max(β)
 
-        def bounce(ray, pi, β, shorter, number, total, w_kept, active, sampler):
+        def bounce(known, ray, pi, β, shorter, number, total, w_kept, active, sampler):
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            bsdf = si.bsdf(ray)
+            bsdf, met = si.bsdf(ray), mi.Bool(active)
             cosine = dr.abs_dot(si.n, ray.d)
             active &= cosine > 0
             shorter = shorter.at(pi.t, cosine)
             vertex = LightVertex(ray.o, ray.d, pi, β / cosine, shorter.one, shorter.more, number)
             connects = active & smooth(bsdf)
             if views.projects:
-                self._to_sensor(si, bsdf, vertex, sampler, views, splat, connects)
+                known = self._to_sensor(si, bsdf, vertex, sampler, views, film, known, connects)
             if self.depths.scatters(2):
                 # A camera path has a vertex of its own at least.
                 w = dr.select(connects & self.depths.scatters(number + 1), dr.max(β), 0)
@@ -155,20 +171,25 @@ class LightSubpaths:
                 taken = sampler.next_1d(active) * total < w
                 w_kept = dr.select(taken, w, w_kept)
                 dr.scatter(kept, vertex, lane, taken)
-            ray, β, shorter, active = self._onwards(si, bsdf, ray, β, shorter, start, number, sampler, active)
+            numbers = sampler.next_1d(active), sampler.next_2d(active)
+            ray, β, shorter, mirrors, active = self._onwards(
+                si, bsdf, ray, β, shorter, start, number, numbers, sampler, active
+            )
+            if table is not None:
+                table.note(number, si.p, pi, mirrors, numbers[0], met)
             pi = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-            return ray, pi, β, shorter, number + 1, total, w_kept, active & pi.is_valid(), sampler
+            return known, ray, pi, β, shorter, number + 1, total, w_kept, active & pi.is_valid(), sampler
 
         one, zero = dr.full(mi.UInt32, 1, count), dr.zeros(mi.Float, count)
-        state = (ray, pi, β, shorter, one, zero, mi.Float(zero), active & pi.is_valid() & (start > 0), sampler)
-        *_, total, w_kept, _, _ = dr.while_loop(state, lambda *s: s[-2], bounce, label="light subpaths")
-        dr.eval(kept, total, w_kept)
+        active &= pi.is_valid() & (start > 0)
+        state = (known, ray, pi, β, shorter, one, zero, mi.Float(zero), active, sampler)
+        known, *_, total, w_kept, _, _ = dr.while_loop(state, lambda *s: s[-2], bounce, label="light subpaths")
+        dr.eval(kept, total, w_kept, known, end if table is not None else None)
         kept.β *= dr.select(w_kept > 0, total / w_kept, 0)
-        return kept
+        return kept, end, known
 
-    def _onwards(self, si, bsdf, ray, β, shorter, start, number, sampler, active):
-        """The next ray, and what it carries."""
-        numbers = sampler.next_1d(active), sampler.next_2d(active)
+    def _onwards(self, si, bsdf, ray, β, shorter, start, number, numbers, sampler, active):
+        """The next ray, what it carries, and was it sampled from a perfect mirror?"""
         bs, at_mirror = bsdf.sample(mi.BSDFContext(mi.TransportMode.Importance), si, *numbers, active)
         mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
@@ -191,9 +212,9 @@ class LightSubpaths:
         ends = number + 1 >= self.depths.rr_depth
         active &= dr.any(β != 0) & self.depths.scatters(number + 1) & (~ends | (sampler.next_1d(active) < p))
         β = dr.select(ends, β / p, β)
-        return spawn_ray(self.scene, si, d, through), β, shorter, active
+        return spawn_ray(self.scene, si, d, through), β, shorter, mirrored, active
 
-    def _to_sensor(self, si, bsdf, vertex: LightVertex, sampler, views: FilmViews, splat, active) -> None:
+    def _to_sensor(self, si, bsdf, vertex: LightVertex, sampler, views: FilmViews, film: Film, known, active) -> Any:
         lens = sampler.next_2d(active) if views.needs_aperture else mi.Point2f(0.5)
         choice = sampler.next_1d(active) if len(views.parts) > 1 else mi.Float(0)
         view = views.of(si.p, lens, choice, active)
@@ -208,7 +229,7 @@ class LightSubpaths:
         active &= dr.any(L != 0) & self.ways.counts(vertex.number + 1, 1)
         to_sensor = spawn_ray_to(self.scene, si, dr.fma(view.d, view.distance, si.p))
         active &= ~self._blocked(to_sensor, active)
-        splat(view.u, L * w, active)
+        return film.add(known, Seen(view.u, lens, vertex.number), L * w, sampler, active)
 
     def _blocked(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
         """Is there anything on the way to the sensor, but for emitters that it does not see?"""

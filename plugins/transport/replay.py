@@ -85,11 +85,11 @@ def leaves(*values) -> list:
         return values
 
 
-_FLAGS = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+FLAGS = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
 
 
-def _derivatives(*values) -> list:
-    return [dr.detach(v) for v in dr.forward_to(list(values), flags=_FLAGS)]
+def derivatives(*values) -> list:
+    return [dr.detach(v) for v in dr.forward_to(list(values), flags=FLAGS)]
 
 
 class Replay:
@@ -130,7 +130,7 @@ class Replay:
             )
             with dr.resume_grad():
                 moving = onwards.moving
-                δdirect, δweight, o, d = _derivatives(direct, onwards.weight, moving.o, moving.d)
+                δdirect, δweight, o, d = derivatives(direct, onwards.weight, moving.o, moving.d)
             total += dr.select(active, vertex.β * δdirect + β * dr.detach(direct), 0)
             weight = dr.detach(onwards.weight)
             β = β * weight + vertex.β * δweight
@@ -166,7 +166,7 @@ class Replay:
                 now = dr.detach(weight)
                 rest = dr.select(now != 0, L * weight / dr.select(now != 0, now, 1), 0)
                 value = dr.sum(δL * (β * direct + rest)) + dr.dot(δo, moving.o) + dr.dot(δd, moving.d)
-                dr.backward_from(dr.select(active, value, 0), flags=_FLAGS)
+                dr.backward_from(dr.select(active, value, 0), flags=FLAGS)
                 δo, δd = dr.select(active, dr.grad(o), δo), dr.select(active, dr.grad(d), δd)
             L += dr.select(active, β * dr.detach(direct), 0)
             return depth - 1, L, δo, δd
@@ -243,7 +243,7 @@ class MovingVertex:
         with dr.resume_grad():
             self.si.p, self.si.n = self.p, self.n
             if mode == dr.ADMode.Forward:
-                p, n, o, d = _derivatives(self.at_first.p, self.at_first.n, self.start.o, self.start.d)
+                p, n, o, d = derivatives(self.at_first.p, self.at_first.n, self.start.o, self.start.d)
                 moved = self._forward(o, d)
                 for leaf, first, later in zip((self.p, self.n, self.d), (p, n, d), moved, strict=True):
                     dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(first), later))
@@ -276,7 +276,7 @@ class MovingVertex:
             si = chain.surface(vertex, x, direction, active)
             with dr.resume_grad():
                 moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
-                found = _derivatives(si.p, si.n, moving.o, moving.d)
+                found = derivatives(si.p, si.n, moving.o, moving.d)
             return depth + 1, *(mi.Vector3f(v) for v in found)
 
         zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
@@ -314,7 +314,7 @@ class MovingVertex:
             with dr.resume_grad():
                 moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
                 value = dr.dot(δp, moving.o) + dr.dot(δn, si.n) + dr.dot(δd, moving.d)
-                dr.backward_from(dr.select(active, value, 0), flags=_FLAGS)
+                dr.backward_from(dr.select(active, value, 0), flags=FLAGS)
                 δo, δd = dr.grad(o), dr.grad(d)
             return depth - 1, mi.Vector3f(δo), mi.Vector3f(0), δd
 
@@ -334,7 +334,7 @@ class MovingVertex:
             chained = self.active & (self._last > 1) & (self.since == 1)
             value += dr.select(chained & ~at_first, dr.dot(δo, start.o), 0)
             value += dr.select(chained, dr.dot(to_first, start.d), 0)
-            dr.backward_from(value, flags=_FLAGS)
+            dr.backward_from(value, flags=FLAGS)
 
 
 class ChosenVertex(MovingVertex):

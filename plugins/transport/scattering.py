@@ -11,7 +11,7 @@ from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below, surfaces
-from rimlight.edge_sampling.parametrisation import Parametrisation, Vicinity, shown_by_mirror
+from rimlight.edge_sampling.parametrisation import Connection, Parametrisation, Vicinity, shown_by_mirror
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to_light
 
 
@@ -143,8 +143,10 @@ class Scattering:
         active &= ds.pdf != 0
         direction, to_lamp = ds.d, None
         if self.attached and self.any_hit_by_rays:
-            direction, weight, visible, to_lamp = self._attach_emitter(si, ds, weight, towards_light, active)
+            direction, attached, visible, to_lamp = self.attach_light(si, ds, towards_light, active)
             active &= visible
+            with dr.resume_grad():
+                weight = dr.replace_grad(weight, attached)
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
             if lune is not None:
@@ -168,9 +170,12 @@ class Scattering:
         with dr.resume_grad(when=self.attached):
             return dr.select(active, L, 0)
 
-    def _attach_emitter(self, si, ds, weight, towards_light, active):
-        """Direction and weight (Lₑ · geometry / density) of a light sample with their gradients, its visibility, and
-        what joins it to `si`."""
+    def attach_light(self, si, ds, towards_light, active):
+        """Direction to a point of a light, or to one at infinity, what arrives from there over `ds.pdf`, whether it is
+        visible, and what joins it to `si`.
+
+        ds : the light as `si` sees it. towards_light : see `reflect`; called for lights without size.
+        """
         scene = self.scene
         on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
         # One ray answers both questions: is the light visible, and which of its triangles is y on?
@@ -197,7 +202,7 @@ class Scattering:
                 moved, at_moved = towards_light(active & follows)
                 direction = dr.select(follows, moved.d, direction)
                 attached = dr.select(follows, at_moved, attached)
-            return direction, dr.replace_grad(weight, attached), visible, to_lamp
+            return direction, attached, visible, to_lamp
 
     def sample_bsdf(
         self,
@@ -220,31 +225,18 @@ class Scattering:
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         else:
             with dr.resume_grad():
-                on_surface = active & pi.is_valid()
-                to_y = self.held.connect(si, pi, ray, on_surface, by_light=False)
+                to_y, ω, attached, scattered = self.throughput(si, bsdf, ray, pi, bs.pdf, vicinity, active, ~mirrored)
                 y = to_y.y
-                ω = dr.select(on_surface, to_y.ω, ray.d)
-                f = bsdf.eval(context, si, si.to_local(ω), active & ~mirrored)
-                attached = f * (dr.select(on_surface, to_y.geometry, 1) / bs.pdf)
-                attached = dr.select(to_y.still, dr.detach(attached), attached)
-                scattered = attached
                 if vicinity is not None:
                     onwards.moving = mi.Ray3f(ray)
                     onwards.moving.o = dr.replace_grad(ray.o, si.p)
-                    around = vicinity.around(bsdf)
-                    scattered = self._slide(si, bsdf, bs, ray, to_y, attached, around, on_surface & ~mirrored)
                 if self.any_mirror:
                     # A mirror turns its ray with it: what that meets slides over the light.
-                    turned, at_mirror = bsdf.sample(context, si, numbers.lobe, numbers.direction, active & mirrored)
-                    wrong = mi.Bool(False)
-                    for other in self.by_density:
-                        wrong |= bsdf == other
-                    p = dr.detach(turned.pdf)
-                    at_mirror *= dr.select(wrong & (p > 0), turned.pdf / dr.select(p > 0, p, 1), 1)
-                    y = dr.select(mirrored, shown_by_mirror(scene, si, turned.wo, ray, pi, active & mirrored), y)
+                    wo, at_mirror = self.mirror(si, bsdf, numbers.lobe, numbers.direction, active & mirrored)
+                    y = dr.select(mirrored, shown_by_mirror(scene, si, wo, ray, pi, active & mirrored), y)
                     attached, scattered = (dr.select(mirrored, at_mirror, x) for x in (attached, scattered))
                     if vicinity is not None:
-                        d = dr.select(mirrored & active, si.to_world(turned.wo), ray.d)
+                        d = dr.select(mirrored & active, si.to_world(wo), ray.d)
                         onwards.moving.d = dr.replace_grad(ray.d, d)
                 onwards.weight = dr.replace_grad(weight, dr.select(active, scattered, 0))
                 weight = dr.replace_grad(weight, dr.select(active, attached, 0))
@@ -262,8 +254,45 @@ class Scattering:
             Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
         return Le, onwards
 
+    def mirror(self, si, bsdf, lobe: mi.Float, direction: mi.Point2f, active) -> tuple[mi.Vector3f, mi.Spectrum]:
+        """Where a perfect mirror or smooth glass sends a path, in the frame of `si`, and what it scatters from there
+        over its probability, of which only the value is divided by. lobe, direction : random numbers."""
+        turned, at_mirror = bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
+        wrong = mi.Bool(False)
+        for other in self.by_density:
+            wrong |= bsdf == other
+        p = dr.detach(turned.pdf)
+        return turned.wo, at_mirror * dr.select(wrong & (p > 0), turned.pdf / dr.select(p > 0, p, 1), 1)
+
+    def throughput(
+        self,
+        si,
+        bsdf,
+        ray: mi.Ray3f,
+        pi: mi.PreliminaryIntersection3f,
+        pdf: mi.Float,
+        vicinity: Vicinity | None,
+        active,
+        rough: mi.Bool,
+    ) -> tuple[Connection, mi.Vector3f, mi.Spectrum, mi.Spectrum]:
+        """What joins `si` to the surface that a ray from there meets, the direction to it, and the light scattered from
+        there over a density: if it is a material point, and as it moves in the vicinity.
+
+        rough : mi.Bool, is the BSDF evaluated? Else all of this is zero.
+        """
+        on_surface = active & pi.is_valid()
+        to_y = self.held.connect(si, pi, ray, on_surface, by_light=False)
+        ω = dr.select(on_surface, to_y.ω, ray.d)
+        f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active & rough)
+        attached = f * (dr.select(on_surface, to_y.geometry, 1) / pdf)
+        attached = dr.select(to_y.still, dr.detach(attached), attached)
+        if vicinity is None:
+            return to_y, ω, attached, attached
+        around = vicinity.around(bsdf)
+        return to_y, ω, attached, self._slide(si, bsdf, pdf, ray, to_y, attached, around, on_surface & rough)
+
     @staticmethod
-    def _slide(si, bsdf, bs, ray, to_y, at_material, vicinity: Vicinity, active) -> mi.Spectrum:
+    def _slide(si, bsdf, pdf, ray, to_y, at_material, vicinity: Vicinity, active) -> mi.Spectrum:
         """Throughput to a point that slides in the vicinity: `at_material`, with its part of the motion, and what is
         held in its direction, with the rest."""
         d = to_y.y.p - si.p
@@ -272,7 +301,7 @@ class Scattering:
         active = active & ~to_y.still & (cosine != 0) & (vicinity.far(dr.detach(dr.squared_norm(d))) < 1)
         # Along the ray, to the plane that moves with y.
         along = dr.dot(d, n) / dr.select(active, cosine, 1)
-        at_direction = bsdf.eval(mi.BSDFContext(), si, si.to_local(ray.d), active) / bs.pdf
+        at_direction = bsdf.eval(mi.BSDFContext(), si, si.to_local(ray.d), active) / pdf
         near = 1 - vicinity.far(dr.square(along))
         total = vicinity.far(dr.squared_norm(d)) * at_material + near * at_direction
         return dr.select(active, total, at_material)

@@ -57,7 +57,7 @@ def main(names: list[str]) -> None:
             runs=c.runs,
             spp=c.reference_spp,
             # Without Russian roulette: its random choices would differ between the images of a run.
-            integrator=mi.load_dict({"type": "path", "max_depth": c.max_depth, "rr_depth": 1000}),
+            integrator=mi.load_dict({"type": c.reference_images, "max_depth": c.max_depth, "rr_depth": 1000}),
             progress=True,
         )
         command = f"python tests/references/make.py {c.name}"

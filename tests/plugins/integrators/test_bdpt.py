@@ -14,6 +14,7 @@ from rimlight._image_advice import ImageAdvice, image_advice
 from rimlight.checks import mean_and_error, z_scores
 from rimlight.cli import main
 from rimlight.integrators._light_image import LightImage
+from rimlight.transport.found_light import Seen
 from rimlight.transport.subpath_weights import Shorter, weight
 
 RUNS = 16
@@ -306,7 +307,8 @@ def test_light_is_normalised_whatever_the_camera_samples(variant, rfilter, borde
     camera.put(corner + sampler.next_2d(), [mi.Float(0)] * 3 + [mi.Float(1), mi.Float(1)])
     n = 8 * (upper - lower)
     grid = mi.Point2f(dr.meshgrid(dr.arange(mi.Float, n), dr.arange(mi.Float, n)))
-    light.add((grid + 0.5) / 8 + lower, mi.Spectrum(2 / 64), mi.Bool(True))
+    seen = Seen((grid + 0.5) / 8 + lower, mi.Point2f(0), mi.UInt32(1))
+    light.add((), seen, mi.Spectrum(2 / 64), None, mi.Bool(True))
     light.add_to(camera)
     image = np.array(film.develop())
     np.testing.assert_allclose(image[..., :3], 1, rtol=1e-2)
@@ -384,9 +386,9 @@ def test_derivatives_are_refused(variant):
     scene = room()
     params = mi.traverse(scene)
     it = mi.load_dict({"type": "bdpt"})
-    with pytest.raises(RuntimeError, match="has no derivative, use prb_edge"):
+    with pytest.raises(RuntimeError, match="has no derivative, use bdpt_edge"):
         it.render_forward(scene, params)
-    with pytest.raises(RuntimeError, match="has no derivative, use prb_edge"):
+    with pytest.raises(RuntimeError, match="has no derivative, use bdpt_edge"):
         it.render_backward(scene, params, mi.TensorXf(0))
 
 
