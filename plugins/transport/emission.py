@@ -121,7 +121,8 @@ class Emission:
     def _density_on_area(self, ds, flags, active) -> mi.Float:
         """By area, with which `Emitter.sample_position` finds the point of an emitter."""
         textured = mi.has_flag(flags, mi.EmitterFlags.SpatiallyVarying)
-        density = ds.emitter.get_shape().pdf_position(ds, active & ~textured)
+        # The same everywhere on a lamp without a texture. (`Shape.pdf_position` fails wherever there are instances.)
+        density = ds.emitter.sample_position(mi.Float(0), mi.Point2f(0.5), active & ~textured)[0].pdf
         if self.any_textured:
             # From a unit in front of the point, the density by solid angle is that by area.
             at = dr.zeros(mi.Interaction3f, dr.width(ds.p))

@@ -239,6 +239,14 @@ def test_interpolated_normals(variant):
     assert_equals_path(room(ball=mesh))
 
 
+def test_instances(variant):
+    p, _, _, faces = cases.ball(4)
+    group = {"type": "shapegroup", "ball": cases.mesh("ball", p, faces, bsdf=SURFACES["metal"])}
+    to_world = mi.ScalarTransform4f().translate([0.1, 0.4, 0.1]).scale([0.5, 0.4, 0.3])
+    ball = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
+    assert_equals_path(room(group=group, ball=ball))
+
+
 CAUSTICS = [("point", "mirror"), ("spot", "thin glass"), ("directional", "glass"), ("led", "mask")]
 
 
