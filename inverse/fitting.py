@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
+from rimlight.edge_sampling.refusals import Refusal
 from rimlight.loading import InputError
 
 from . import batches, free_parameters, progress, sources
@@ -187,9 +188,9 @@ class Fit:
         self._save()
 
     def step(self) -> Step:
-        """Take one step of the plan, and tell the functions of `on_step`. RuntimeError : none is left."""
+        """Take one step of the plan, and tell the functions of `on_step`. Refusal : none is left."""
         if self.progress.segment >= len(self.plan):
-            raise RuntimeError(f"fit: there is no step left of {self.progress.step}")
+            raise Refusal(f"fit: there is no step left of {self.progress.step}")
         self._clock_starts()
         with alone(self.problem.variant):
             step = self._step()

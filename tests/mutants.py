@@ -319,7 +319,7 @@ MUTANTS = [
     mutant(
         "channels: what a ray meets follows the surface",
         "plugins/transport/channels.py",
-        "si = seen_by_camera(ray, pi, active, attached=attached)",
+        "si = seen_by_camera(self.scene, ray, pi, active, attached=attached)",
         "si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)",
     ),
     mutant(

@@ -55,6 +55,7 @@ SQUARE, LARGEST = 5, 5.5
 SPECIAL = {
     "cut": "meshes stand in the floor, and in each other; none of them is a lamp",
     "jumps": "all that things have are perfect mirrors, smooth glass, and textures that jump",
+    "instances": "there are two or three instances of meshes besides, which mostly are what moves",
     "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
@@ -180,8 +181,8 @@ class Generator:
         self.labels.append(f"x{self.scale:g}" + (f"@{np.linalg.norm(self.origin):g}" if self.origin.any() else ""))
         if self.home:
             self.scale, self.origin = 1.0, np.zeros(3)
-        # What moves must not show instances, whose outlines are unknown: no sky, no gloss, no interreflections.
-        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams")
+        # What moves must not show instances, whose outlines were unknown: no sky, no gloss, no interreflections.
+        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams", "instances")
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
@@ -196,6 +197,8 @@ class Generator:
             self.make_thing(i)
         if self.instances:
             self.make_instances()
+        elif self.special == "instances":
+            self.make_moving_instances()
         kinds: list[str] = []
         for i in range(self.rng.integers(1, 3)):
             kinds.append(self.make_light(i, kinds))
@@ -460,6 +463,33 @@ class Generator:
                 "shapegroup": {"type": "ref", "id": "group"},
             }
         self.labels.append("instances")
+
+    def make_moving_instances(self) -> None:
+        """Two or three, of one or two meshes each, some of them stretched or reflected."""
+        group: dict[str, Any] = {"type": "shapegroup"}
+        world, (self.scale, self.origin) = (self.scale, self.origin), (1.0, np.zeros(3))
+        for i in range(self.pick(1, 1, 2)):
+            kind, flat = self.pick("coarse ball", "ball", "torus", "tetra"), self.chance(0.5)
+            shape = {"coarse ball": ball(3), "ball": ball(12), "torus": torus(8), "tetra": tetrahedron()}[kind]
+            material = "normalmap"
+            while material == "normalmap":  # of what moves, refused
+                material, bsdf = self.bsdf(uv=kind != "tetra")
+            smooth = not flat and kind != "tetra"
+            group[f"part{i}"] = self.mesh(
+                f"part{i}", shape, self.rotation() * 0.35, [0.3 * i, 0, 0], bsdf, smooth=smooth, uv=kind != "tetra"
+            )
+            self.labels.append(f"{'smooth-' * smooth}{kind}:{material}")
+        self.scale, self.origin = world
+        self.objects["group"] = group
+        for i, centre in enumerate([[-1.9, 0.5, -0.7], [1.9, 0.6, -0.8], [0.1, 0.4, -1.4]][: self.pick(2, 3)]):
+            stretch = np.diag([self.pick(1, 1, -1), self.uniform(0.7, 1.3), 1])
+            self.objects[f"copy{i}"] = {
+                "type": "instance",
+                "to_world": self.frame(self.rotation() @ stretch, centre),
+                "shapegroup": {"type": "ref", "id": "group"},
+            }
+            self.movable["thing"] += [(f"copy{i}.to_world", "frame", np.array(centre))] * 9
+        self.labels.append(f"{i + 1} instances")
 
     def make_light(self, i: int, before: list[str]) -> str:
         name = f"light{i}"

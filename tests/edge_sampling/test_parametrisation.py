@@ -33,7 +33,7 @@ def turn(move, held=0.0):
     pi = there.ray_intersect_preliminary(ray)
     assert dr.all(pi.is_valid())
     ray.o = move(θ, x, params)
-    si = sliding_point(ray, pi, mi.Float(held), mi.Bool(True))
+    si = sliding_point(there, ray, pi, mi.Float(held), mi.Bool(True))
     look_from(si, ray.o, ray, pi.t)
     assert np.allclose(np.array(dr.detach(si.to_world(si.wi))), -np.array(d), atol=1e-6)
     return np.array(dr.forward_to(si.to_world(si.wi))) * np.array(pi.t)

@@ -48,7 +48,7 @@ def folder(tmp_path) -> Path:
         scene_with('<shape type="ply"><string name="filename" value="gone.ply"/></shape>')
     )
     (path / "no_sensor.xml").write_text(scene_with('<shape type="cube"/>', sensor=""))
-    group = '<shape type="shapegroup" id="group"><shape type="cube"/></shape>'
+    group = '<shape type="shapegroup" id="group"><shape type="sphere"/></shape>'
     copy = '<shape type="instance" id="copy"><ref id="group"/></shape>'
     (path / "instance.xml").write_text(scene_with(group + copy))
     for name, type_, width in (("no_width", "perspective", 0), ("no_width_orthographic", "orthographic", 0)):

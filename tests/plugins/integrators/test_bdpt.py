@@ -413,7 +413,7 @@ def test_spectral_variants_are_refused(variant):
 
 
 #: Of these, `path` sees next to nothing in as many samples. `ptracer` does: what the camera sees is matt.
-RARE = ("lampshade", "out_of_frame")
+RARE = ("lampshade", "lampshade_wall", "out_of_frame")
 
 
 @pytest.mark.parametrize("case", [c for c in cases.CASES if c.needs is None], ids=lambda c: c.name)
