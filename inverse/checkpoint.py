@@ -64,7 +64,7 @@ def load(path: Path, who: str = "fit") -> tuple[dict[str, np.ndarray], dict[str,
     try:
         with zipfile.ZipFile(path) as archive:  # NumPy looks at no checksum of what it reads to the last number
             if damaged := archive.testzip():
-                raise ValueError(f"its part {damaged}")
+                raise zipfile.BadZipFile(f"its part {damaged}")
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             facts = json.loads(str(file["facts"]))
             parts = {name: file[name] for name in file.files}
