@@ -68,6 +68,25 @@ def boxes(apart: bool = False) -> mi.Scene:
     return scene(sensor=camera((0.6, 2.2, -5), (0, 0.4, 0)), **room(), board=board, **shapes)
 
 
+def reflected_ball(apart: bool = False) -> mi.Scene:
+    """A coarse ball with interpolated normals, which its instance reflects. apart : as a mesh."""
+    vertices, _, _, faces = ball(6)
+    matt = diffuse(0.8, 0.3, 0.2)
+    to_world = mi.ScalarTransform4f().translate([0.1, 0.7, 0]).rotate([0.3, 1, 0.2], 30).scale([-0.7, 0.4, 0.5])
+    inside = mesh("ball", vertices, faces, True, bsdf=matt)
+    placed = [list(to_world @ mi.ScalarPoint3f(*v)) for v in vertices]
+    thing: Any = mesh("thing", placed, np.array(faces)[:, ::-1], True, bsdf=matt)
+    params = mi.traverse(thing)
+    normals = np.reshape(mi.traverse(inside)["vertex_normals"], (-1, 3)).tolist()
+    params["vertex_normals"] = np.ravel([list(to_world @ mi.ScalarNormal3f(*n)) for n in normals]).astype(np.float32)
+    params.update()
+    shapes: dict[str, Any] = {"thing": thing}
+    if not apart:
+        instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
+        shapes = {"group": {"type": "shapegroup", "ball": inside}, "thing": instance}
+    return scene(sensor=camera((0.6, 1.6, -3.4), (0.1, 0.6, 0)), **room(), **shapes)
+
+
 def stretched_ball() -> mi.Scene:
     """A smooth-shaded ball with a picture, which its instance stretches: normals and texture move over it."""
     vertices, _, uv, faces = ball(32)

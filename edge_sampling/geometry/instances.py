@@ -82,8 +82,8 @@ class MeshOfInstance:
         return has_texcoords(self.inner)
 
     def has_flipped_normals(self) -> bool:
-        """A reflection turns the normals round, against the order of the vertices."""
-        return is_flipped(self.inner) != bool((dr.det(mi.Matrix3f(dr.detach(matrix_of(self.instance)))) < 0)[0])
+        """As in the group: a reflection turns the faces round, but their normals stay outside."""
+        return is_flipped(self.inner)
 
     def __getattr__(self, name: str) -> Any:
         if name in ("id", "bbox", "ptr"):

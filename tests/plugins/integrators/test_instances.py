@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import building
 import drjit as dr
 import instances
@@ -40,12 +42,12 @@ def test_frozen_functions(name, key):
     assert_frozen_is_unfrozen(instances.stretched_ball(), mi.load_dict(INTEGRATORS[name]), key)
 
 
-def assert_equal(key: str, motion: dict, *others: str) -> None:
+def assert_equal(key: str, motion: dict, *others: str, make: Callable = instances.boxes) -> None:
     """The derivative of instances is the sum of those of meshes, but for other random numbers."""
     made = mi.load_dict(INTEGRATORS["direct_edge"])
-    a = forward(instances.boxes(), made, 128, key=key, **motion)
+    a = forward(make(), made, 128, key=key, **motion)
     assert not made.search.geometry.others
-    apart = instances.boxes(apart=True)
+    apart = make(apart=True)
     b = sum(forward(apart, mi.load_dict(INTEGRATORS["direct_edge"]), 128, key=k, **motion) for k in others or (key,))
     assert (a * b).sum() / (b * b).sum() == pytest.approx(1, abs=0.02)
     assert np.abs(a - b).sum() < 0.15 * np.abs(b).sum()  # noise: 0.05 to 0.12
@@ -55,6 +57,12 @@ def assert_equal(key: str, motion: dict, *others: str) -> None:
 def test_instances_that_stand_still_equal_meshes(key):
     """In what the camera sees, and in the shadows; of reflected and stretched ones, too."""
     assert_equal(key, {"direction": [1, 0.3, 0.2]})
+
+
+@pytest.mark.parametrize("key", ["sensor.to_world", "lamp.vertex_positions"])
+def test_reflected_instances_with_interpolated_normals(key):
+    """Their outlines are where these normals turn away: a reflection does not turn them round."""
+    assert_equal(key, {"direction": [1, 0.3, 0.2]}, make=instances.reflected_ball)
 
 
 @pytest.mark.parametrize("k", [1, 2])
