@@ -10,6 +10,7 @@ import instances
 import mitsuba as mi
 import numpy as np
 import pytest
+from both_modes import assert_backward_is_forward
 from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, derivative_image
@@ -24,16 +25,7 @@ def forward(scene: mi.Scene, made: mi.Integrator, spp: int = 32, **motion) -> np
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_gradients_are_those_of_forward_mode(name):
     scene, made = instances.stretched_ball(), mi.load_dict(INTEGRATORS[name])
-    motion = Motion(scene, "thing.to_world", rotate=[0.3, 1, 0.2])
-    expected = np.array(derivative_image(scene, made, motion, spp=16, seed=3), float)
-    weight = np.random.default_rng(0).uniform(0.5, 1, expected.shape)
-    θ = mi.Float(0)
-    dr.enable_grad(θ)
-    motion.apply(θ)
-    made.render_backward(scene, motion.params, mi.TensorXf(weight.astype(np.float32)), seed=3, spp=16)
-    dr.enqueue(dr.ADMode.Backward, θ)
-    dr.traverse(dr.ADMode.Backward)
-    assert abs(dr.grad(θ)[0] - (weight * expected).sum()) < 1e-3 * np.abs(weight * expected).sum()
+    assert_backward_is_forward(scene, made, Motion(scene, "thing.to_world", rotate=[0.3, 1, 0.2]))
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mirrors
 import mitsuba as mi
 import numpy as np
 import pytest
+from both_modes import assert_backward_is_forward
 from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, compare, derivative_image, finite_differences
@@ -29,17 +29,9 @@ INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb
 )
 def test_gradients_are_those_of_forward_mode(name, make, key):
     scene, made = make(), mi.load_dict(INTEGRATORS[name])
-    motion = Motion(scene, key, direction=[1] if key.endswith("data") else [1, 0.4, 0.2])
-    forward = np.array(derivative_image(scene, made, motion, spp=16, seed=3), float)
-    weight = np.random.default_rng(0).uniform(0.5, 1, forward.shape)
-    θ = mi.Float(0)
-    dr.enable_grad(θ)
-    motion.apply(θ)
-    made.render_backward(scene, motion.params, mi.TensorXf(weight.astype(np.float32)), seed=3, spp=16)
-    dr.enqueue(dr.ADMode.Backward, θ)
-    dr.traverse(dr.ADMode.Backward)
-    expected = (weight * forward).sum()
-    assert abs(dr.grad(θ)[0] - expected) < 1e-3 * np.abs(weight * forward).sum()
+    assert_backward_is_forward(
+        scene, made, Motion(scene, key, direction=[1] if key.endswith("data") else [1, 0.4, 0.2])
+    )
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
