@@ -56,8 +56,9 @@ class BDPTIntegrator(ADIntegrator):
     their light by connections with camera paths alone.
 
     **Limits.** There is no derivative: use ``bdpt_edge``. Participating media, spectral and polarised variants are
-    refused. In the open, it takes about twice the time of ``path`` for the same noise. A frozen function (``dr.freeze``)
-    keeps the extent that the scene had when it was recorded: record it again (``clear``) when the scene grows.
+    refused. In the open, it takes about twice the time of ``path`` for the same noise. A frozen function
+    (``dr.freeze``) keeps the extent that the scene had when it was recorded: record it again (``clear``) when the
+    scene grows.
 
     In Python, the attribute ``ways`` selects what is rendered: ``integrator.ways = (s, t)`` are the paths of s vertices
     that come from the light and t that come from the camera, with the weights that they have in the image; None stands
