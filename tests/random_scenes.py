@@ -57,6 +57,7 @@ SPECIAL = {
     "jumps": "all that things have are perfect mirrors, smooth glass, and textures that jump",
     "instances": "there are two or three instances of meshes besides, which mostly are what moves",
     "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
+    "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 
@@ -633,6 +634,10 @@ class Generator:
 
 
 def make(seed: int, sampler: str = "independent", home: bool = False, special: str = "") -> RandomScene:
+    if special == "rooms":
+        from random_rooms import RoomGenerator  # which is built on this file
+
+        return RoomGenerator(seed, sampler, home, special).make()
     return Generator(seed, sampler, home, special).make()
 
 

@@ -25,9 +25,9 @@ from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import inside_frame
 
+from .crease import Crease, Directions, LuneOrCrease
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
-from .lune import Lune
 from .tracer import Tracer
 
 
@@ -59,7 +59,7 @@ class BoundaryPoints:
     weights  : of these rays.
     active   : mi.Bool, (N,)
     horizons : on which side of a horizon of interpolated normals each of the rays is; None where there are none.
-    lune : from where all light comes that can jump, where it is active; None where there are none.
+    lune : from where light is looked for on both sides, where it is active; None: as everywhere.
     sensor_moves : does the velocity depend on parameters of the sensor?
     """
 
@@ -71,7 +71,7 @@ class BoundaryPoints:
     weights: list[mi.Spectrum]
     active: mi.Bool
     horizons: list[Horizon | None]
-    lune: Lune | None
+    lune: Directions | None
     sensor_moves: bool
 
 
@@ -155,7 +155,7 @@ class FilmBoundary:
             # Where interpolated normals go on being lit, the shadow of a mesh on itself begins at edges that are
             # silhouettes as seen from a light: that is a jump, too, if the light has no size.
             lights = self.lights.places(scene) if outlines.any_smooth else None
-            chosen = outlines.choose(outlines.visible_lengths(at, lights), sampler, count)
+            chosen = outlines.choose(outlines.visible_lengths(at, lights, tracer.shares_directions), sampler, count)
             found = outlines.find(at, chosen)
 
         # Only here does the gradient enter: the velocity of a point that is fixed on the edge.
@@ -181,6 +181,12 @@ class FilmBoundary:
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
             n_dl = dr.select(active, n_dl, 0)
             lune = outlines.lune(at, chosen, lights)
+            if outlines.matt is not None and tracer.shares_directions:
+                bent = active & chosen.is_edge & dr.gather(mi.Bool, outlines.matt, chosen.edge)
+                if horizons[0] is not None:
+                    bent &= horizons[0].side == 0
+                crease = Crease.between(rays, met, bent)
+                lune = LuneOrCrease(lune, crease) if lune is not None else crease
             return BoundaryPoints(u, n_dl, velocity, rays, met, weights, active, horizons, lune, at.projection.attached)
 
     # ---------------------- What is on their sides ----------------------

@@ -15,12 +15,16 @@ from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
 
+from .crease import is_matt
 from .horizon import HorizonPoint, Horizons
 from .lune import Lune, spreads
 
 #: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
 #: an edge that cannot be seen changes nothing, not even the last bit.
 LENGTH_UNIT = 2.0**-16
+
+#: Creases of matt surfaces are chosen by their length times the sine of their angle, but at least times this.
+LEAST = 0.05
 
 
 @dataclass
@@ -82,7 +86,7 @@ class FilmOutlines:
     geometry, edges, moving, soft, seams : see `FilmBoundary`.
     """
 
-    _PARTS = ("edges", "corners", "spreads", "horizons", "curves", "lines")
+    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "lines")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool, seams: bool):
@@ -96,6 +100,9 @@ class FilmOutlines:
         #: Which edges are on meshes that reflect light from all directions, but from behind?
         spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes])
         self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
+        #: And which on meshes that are matt?
+        matt = np.array([m.bsdf() is not None and is_matt(m.bsdf()) for m in geometry.meshes])[edges.mesh].all(1)
+        self.matt = mi.Bool(matt) if len(edges) and matt.any() else None
         shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
         shapes = tuple(s for s, moves in shapes if moves)
         self.curves = Curves(shapes, seams=seams) if shapes else None
@@ -196,8 +203,9 @@ class FilmOutlines:
 
     # ---------------------- Lengths ----------------------
 
-    def _jumps(self, at: Placed, edge: mi.UInt32, lights: mi.Vector4f | None) -> mi.Bool:
-        """Does more jump at the edge, as seen from the sensor, than soft light that the planes of its faces hide?"""
+    def _jumps(self, at: Placed, edge: mi.UInt32, lights: mi.Vector4f | None, creases: bool = True) -> mi.Bool:
+        """Does more jump at the edge, as seen from the sensor, than soft light that the planes of its faces hide?
+        creases : do those between faces that are both seen count?"""
         projection = at.projection
         jumps = self.edges.is_boundary(
             at.positions,
@@ -205,15 +213,18 @@ class FilmOutlines:
             projection.eye(),
             view=projection.view() if projection.orthographic else None,
             radius=projection.lens_radius(),
-            geometry=self.geometry,
+            geometry=self.geometry if creases else None,
         )
         if lights is not None:
             jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights)
         return jumps
 
-    def visible_lengths(self, at: Placed, lights: mi.Vector4f | None) -> mi.Float:
+    def visible_lengths(self, at: Placed, lights: mi.Vector4f | None, by_angle: bool) -> mi.Float:
         """Length inside the frame of each edge, cut, horizon and piece of a curve, 0 where nothing can jump: pixels on
-        the film; less where little jumps; of horizons and curves, an estimate."""
+        the film; less where little jumps; of horizons and curves, an estimate.
+
+        by_angle : does the noise of creases fall with their angle, too?
+        """
         lengths, projection, positions = [], at.projection, at.positions
         if self.edges is not None:
             edge, face = (dr.arange(mi.UInt32, n) for n in self.counts[:2])
@@ -223,6 +234,8 @@ class FilmOutlines:
             # The less faces turn, the less their planes hide: about as the square of the angle.
             bend = self.edges.bend(positions, edge) * lengths[0] if self.soft and self.edges.any_smooth else 0
             lengths[0] = dr.select(jumps, lengths[0], bend)
+            if self.matt is not None and by_angle:
+                lengths[0] *= self._part_of_crease(at, edge)
         if self.horizons is not None:
             face = dr.arange(mi.UInt32, self.counts[2])
             eye, far, radius = projection.viewer(), projection.orthographic, projection.lens_radius()
@@ -232,6 +245,12 @@ class FilmOutlines:
         if self.curves is not None:
             lengths.append(self._curve_length(at))
         return dr.concat(lengths) if len(lengths) > 1 else lengths[0]
+
+    def _part_of_crease(self, at: Placed, edge: mi.UInt32) -> mi.Float:
+        """The less a matt surface turns at a crease, the less jumps there: about as the angle. 1 at all other edges."""
+        crease = dr.gather(mi.Bool, self.matt, edge) & ~self._jumps(at, edge, None, creases=False)
+        turn = self.edges.turn(at.positions, self.geometry.normals(), edge)
+        return dr.select(crease, dr.clip(turn, LEAST, 1), 1)
 
     def _curve_length(self, at: Placed) -> mi.Float:
         """About the length of each piece of a curve, 0 only where it is certainly out of the frame."""

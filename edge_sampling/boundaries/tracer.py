@@ -10,6 +10,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity
 
+from .crease import Directions
 from .horizon import Horizon
 from .lune import Lune
 
@@ -41,10 +42,12 @@ class Tracer(Protocol):
 
     scene : mi.Scene
     lights : chooses one of many lights; None: all are equally likely.
+    shares_directions : may it be told in which directions to look for the light that a crease reflects?
     """
 
     scene: mi.Scene
     lights: LightChoice | None
+    shares_directions: bool
 
     def scatters(self, depth: mi.UInt32 | int) -> mi.Bool | bool:
         """May a vertex of this number reflect direct light?"""
@@ -59,10 +62,11 @@ class Tracer(Protocol):
         sampler: mi.Sampler,
         active: mi.Bool,
         horizon: Horizon | None,
-        lune: Lune | None,
+        lune: Directions | None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, of which the first hit, `pi`, is on a side of a horizon. Where there is
-        a lune, only light from there need be reflected: what else there is does not jump."""
+        a lune, only light from there need be reflected: what else there is does not jump. At a crease, light is looked
+        for in its directions."""
 
     def scattered(
         self,

@@ -229,6 +229,16 @@ class DeviceEdges:
         state = (dr.zeros(mi.UInt32, width), dr.full(mi.Bool, False, width))
         return dr.while_loop(state, lambda k, found: ~found & (k < count), look, label="silhouettes of lights")[1]
 
+    def turn(self, positions: mi.Float, normals: mi.Float, edge: mi.UInt32) -> mi.Float:
+        """By how much the normals that shade both sides of a crease differ: of flat faces, the sine of their angle; of
+        split vertices, the length of their difference. 1 at all other edges."""
+        kind = dr.gather(mi.UInt32, self._kind, edge)
+        first, second = (dr.normalize(n) for n in self.normals(positions, edge))
+        turn = dr.select(kind == int(EdgeKind.FLAT), dr.norm(dr.cross(first, second)), 1)
+        if EdgeKind.SPLIT not in self._kinds:
+            return turn
+        return dr.select(kind == int(EdgeKind.SPLIT), self.normals_differ(normals, edge), turn)
+
     def normals_differ(self, normals: mi.Float, edge: mi.UInt32) -> mi.Float:
         """By how much the vertex normals of the two sides differ at most."""
         sides = [self._points_of_side(normals, edge, side) for side in (0, 1)]

@@ -8,8 +8,8 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
-from rimlight.edge_sampling.boundaries.lune import Lune
 
 from .bidirectional import CameraPaths
 from .emission import Around, Emission
@@ -57,6 +57,9 @@ class BidirectionalTracer(PathTracer):
     around : the scene.
     """
 
+    #: Light is looked for by connections, too.
+    shares_directions = False
+
     light_sampler: mi.Sampler | None = None
     around: Around | None = None
 
@@ -76,7 +79,7 @@ class BidirectionalTracer(PathTracer):
         *,
         attached: bool,
         horizon: Horizon | None = None,
-        lune: Lune | None = None,
+        lune: Directions | None = None,
         pi: mi.PreliminaryIntersection3f | None = None,
     ) -> Radiance:
         if attached:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
-from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity
 
@@ -57,7 +57,7 @@ def scattered_light(
     depths: Depths,
     active: mi.Bool,
     beside_outline: mi.Bool | None = None,
-    lune: Lune | None = None,
+    lune: Directions | None = None,
     lights: LightChoice | None = None,
     fine_mirrors: FineMirrors | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:

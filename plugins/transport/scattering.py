@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.boundaries.lune import Lune
+from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.geometry.meshes import objects_below, surfaces
@@ -95,13 +95,14 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
-        lune: Lune | None = None,
+        lune: Directions | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Direct illumination that `si` reflects, and the next vertex.
 
         vicinity : in which that slides; None: it is a material point.
         met : what the ray to it meets, if that is known.
-        lune : where it is active, only what comes from there is found. Only where no gradients are carried.
+        lune : where it is active, directions are sampled from there, and only what comes from a lune is found. Only
+            where no gradients are carried.
         """
         chosen = self._choose(si, numbers, active)
         from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, lune, chosen) if self.any else 0
@@ -118,7 +119,7 @@ class Scattering:
         return self.lights.choose(at.p, mi.Vector3f(facing), numbers.light.x, active)
 
     def sample_emitter(
-        self, si, bsdf, sample: mi.Point2f, active, lune: Lune | None = None, chosen: ChosenLight | None = None
+        self, si, bsdf, sample: mi.Point2f, active, lune: Directions | None = None, chosen: ChosenLight | None = None
     ):
         """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). lune : see `scatter`. chosen : which."""
 
@@ -131,7 +132,7 @@ class Scattering:
 
         return self.reflect(si, bsdf, towards_light, active, lune)
 
-    def reflect(self, si, bsdf, towards_light, active, lune: Lune | None = None):
+    def reflect(self, si, bsdf, towards_light, active, lune: Directions | None = None):
         """Radiance reflected at `si` by what `towards_light` samples: mi.Spectrum, (N,).
 
         towards_light : maps `active` to a direction and the light from there over its density, as Mitsuba's
@@ -212,7 +213,7 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
-        lune: Lune | None = None,
+        lune: Directions | None = None,
         chosen: ChosenLight | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
@@ -358,7 +359,7 @@ def next_vertex(
     active: mi.Bool,
     vicinity: Vicinity | None = None,
     met: mi.PreliminaryIntersection3f | None = None,
-    lune: Lune | None = None,
+    lune: Directions | None = None,
 ) -> tuple[mi.BSDFSample3f, Next]:
     """A direction sampled from the BSDF, and the vertex there. Detached.
 

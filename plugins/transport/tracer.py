@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
-from rimlight.edge_sampling.boundaries.lune import Lune
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
@@ -47,6 +47,9 @@ class PathTracer:
     #: See `Scattering`.
     lights: LightChoice | None = None
 
+    #: See `rimlight.edge_sampling.boundaries.tracer.Tracer`.
+    shares_directions = True
+
     #: Whose normals are turned on the sides of boundaries: where paths are traced with detached values in a derivative.
     fine_mirrors: FineMirrors | None = None
 
@@ -70,7 +73,7 @@ class PathTracer:
         *,
         attached: bool,
         horizon: Horizon | None = None,
-        lune: Lune | None = None,
+        lune: Directions | None = None,
         pi: mi.PreliminaryIntersection3f | None = None,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
@@ -138,7 +141,7 @@ class PathTracer:
         sampler: mi.Sampler,
         active: mi.Bool,
         horizon: Horizon | None,
-        lune: Lune | None,
+        lune: Directions | None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, detached."""
         found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, lune=lune, pi=pi)
