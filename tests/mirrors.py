@@ -252,6 +252,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "mirror_camera": (over_mirror, CAMERA, 2e-3, 2),
     "two_mirrors": (two_mirrors, TURN, 3e-3, 4),
     "mirrored_cut": (mirrored_cut, SLIDE, 3e-3, 3),
+    "mirrored_cut_sphere": (mirrored_cut_sphere, {"key": "ball.to_world", "direction": [1, 0.4, 0.3]}, 3e-3, 3),
     "pane": (pane, SLIDE, 2e-3, 5),
     "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),

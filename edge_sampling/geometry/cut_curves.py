@@ -287,13 +287,17 @@ class CutCurves:
         normals, distances = zip(*((dr.detach(n), g - dr.detach(g)) for g, n in surfaces), strict=True)
         return stay_on(p, normals, distances, mi.Bool(True)), mi.Vector3f(tangent)
 
-    def curvature(self, positions: mi.Float, piece: mi.UInt32) -> mi.Float:
-        """The largest curvature of both surfaces. Detached."""
-        largest = mi.Float(0)
+    def is_met(
+        self, positions: mi.Float, piece: mi.UInt32, p: mi.Point3f, d: mi.Vector3f, q: mi.Point3f, slack: mi.Float
+    ) -> mi.Bool:
+        """Does a ray that passes close by a point p of a piece, in the direction d, meet one of both surfaces there, at
+        its point q, and not the other side of a sphere, behind which the curve is? slack : for rounding."""
+        met, direction = mi.Bool(False), mi.Vector3d(d)
         for s in self._pairs.take(piece).surfaces(dr.detach(positions)):
-            flat = s.is_a(Kind.PLANE) | s.is_a(Kind.DISK)
-            largest = dr.maximum(largest, mi.Float(dr.select(flat, 0, dr.rcp(dr.norm(s.x)))))
-        return largest
+            off, n = s.distance(mi.Vector3d(q))
+            facing = dr.dot(n, direction) * dr.dot(s.distance(mi.Vector3d(p))[1], direction) > 0
+            met |= facing & (dr.abs(off) <= mi.Float64(slack))
+        return met
 
     # ---------------------- As edges ----------------------
 

@@ -148,12 +148,13 @@ class DeviceEdges:
 
     def _is_hidden_line(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, rays, met) -> mi.Bool:
         """Does one of two rays beside a line in which shapes cut through each other miss both?"""
-        missed, bent = mi.Bool(False), mi.Float(0)
-        if self.curves is not None:
-            curved, piece = self._piece(edge)
-            bent = dr.select(curved, self.curves.curvature(positions, piece), 0)
+        missed = mi.Bool(False)
         for ray, si in zip(rays, met, strict=True):
-            there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o) + bent * dr.squared_norm(p - si.p)
+            slack = rounding(p, ray.o)
+            there = dr.abs_dot(si.n, p - si.p) <= slack
+            if self.curves is not None:
+                curved, piece = self._piece(edge)
+                there = dr.select(curved, self.curves.is_met(positions, piece, p, ray.d, si.p, slack), there)
             missed |= ~(si.is_valid() & there) & ~self._lets_through(si)
         return missed
 
