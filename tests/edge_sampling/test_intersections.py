@@ -94,6 +94,16 @@ def test_lines_end_where_one_of_the_meshes_does(turn):
     assert np.linalg.norm(found, axis=2).max() == pytest.approx(1, abs=1e-5)
 
 
+def test_lines_that_end_where_the_edges_of_both_meshes_meet():
+    """A wall as wide as the floor that it stands in."""
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5))
+    wall = quad((-2, -0.5, 0.9), (4, 0, 0), (0, 2.5, 0), "wall", bsdf=diffuse(0.5))
+    lines, geometry = intersections(scene(floor=floor, wall=wall))
+    found = pieces(lines, geometry)
+    assert len(found) == 3
+    assert length(found) == pytest.approx(4, rel=1e-5)
+
+
 def test_what_only_touches_does_not_cut():
     upright = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (0, 1) for x in (-0.5, 0.5)])
     box = mesh("box", upright, CUBE_FACES, bsdf=diffuse(0.5))
