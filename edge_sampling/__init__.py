@@ -11,6 +11,7 @@ from .choice.edge_tree import EdgeTree
 from .choice.sampling import EdgeSample, Reservoir, sample_edge, stratified
 from .choice.silhouettes import Silhouettes
 from .choice.views import Cone, Lobe, View
+from .geometry.cut_curves import CutCurves
 from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .geometry.intersections import Intersections
 from .geometry.meshes import Geometry, objects_below
@@ -26,6 +27,7 @@ __all__ = [
     "Batch",
     "BoundarySamples",
     "Cone",
+    "CutCurves",
     "EdgeKind",
     "EdgeSample",
     "EdgeTree",

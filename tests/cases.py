@@ -28,7 +28,7 @@ from building import (
     quad,
     scene,
 )
-from cuts import CUTS
+from cuts import CURVES, CUTS
 from hidden_lights import HIDDEN
 from instances import INSTANCES
 from mirrors import MIRRORS, ball_of_index
@@ -909,8 +909,8 @@ CASES = [
         for k, (*of, depth) in (CUTS | MIRRORS | BEAMS).items()
     ),
     *(
-        Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k == "chair_slides" else 1024)
-        for k, (*of, depth) in INSTANCES.items()
+        Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k.endswith("_slides") else 1024)
+        for k, (*of, depth) in (INSTANCES | CURVES).items()
     ),
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")

@@ -1,4 +1,4 @@
-"""Meshes that cut through each other: what `cases.py` has of lines which are no edges."""
+"""Shapes that cut through each other: what `cases.py` has of lines which are no edges."""
 
 from __future__ import annotations
 
@@ -81,6 +81,42 @@ def spike() -> mi.Scene:
     return scene(sensor=camera(*LOOK), spike=thing, floor=floor, lamp=lamp())
 
 
+def sunk_sphere() -> mi.Scene:
+    """A sphere stands a little in the floor, before a wall."""
+    thing = {"type": "sphere", "center": [0.1, 0.3, 0], "radius": 0.5, "bsdf": diffuse(0.8, 0.5, 0.3)}
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
+    wall = quad((-2, -0.5, 0.9), (4, 0, 0), (0, 2.5, 0), "wall", bsdf=diffuse(0.7, 0.4, 0.4, two_sided=True))
+    return scene(sensor=camera(*LOOK), ball=thing, floor=floor, wall=wall, lamp=lamp())
+
+
+def pillar() -> mi.Scene:
+    """A cylinder leans in the floor, a disk cuts through both, and a sphere through the cylinder."""
+    colour = lambda *c: diffuse(*c, two_sided=True)
+    axis = {
+        "type": "cylinder",
+        "p0": [-0.3, -0.5, 0.2],
+        "p1": [0.5, 1.1, 0],
+        "radius": 0.3,
+        "bsdf": colour(0.8, 0.5, 0.3),
+    }
+    plate = {
+        "type": "disk",
+        "to_world": mi.ScalarTransform4f().translate([0.1, 0.1, -0.1]).rotate([0.8, 0.6, 0], 60).scale(0.8),
+        "bsdf": colour(0.3, 0.7, 0.4),
+    }
+    knob = {"type": "sphere", "center": [0.45, 0.7, -0.2], "radius": 0.3, "bsdf": colour(0.3, 0.3, 0.8)}
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=colour(0.5, 0.6, 0.7))
+    return scene(sensor=camera(*LOOK), axis=axis, plate=plate, knob=knob, floor=floor, lamp=lamp())
+
+
+def cut_bulb() -> mi.Scene:
+    """A sphere that shines, half sunk in a board, whose light falls on a floor."""
+    bulb = {"type": "sphere", "center": [0.1, 0.9, 0], "radius": 0.3, "bsdf": diffuse(0.0), "emitter": light(9, 8, 7)}
+    board = quad((-0.4, 1.0, -0.5), (1.0, -0.1, 0), (0, 0, 1), "board", bsdf=diffuse(0.0, two_sided=True))
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
+    return scene(sensor=camera((0.4, 2.0, -3.6), (0, 0.5, 0)), bulb=bulb, board=board, floor=floor)
+
+
 SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0, 0.3]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
 SINK = {"key": "cube.vertex_positions", "direction": [0, -1, 0]}
@@ -90,6 +126,10 @@ BALL = {"key": "ball.vertex_positions", "direction": [0.77, 0.5, -0.3]}
 BOARD = {"key": "board.vertex_positions", "direction": [1, 0.2, 0]}
 DEFORM = {"key": "knot.vertex_positions", "direction": [1, 0.3, 0], "vertices": list(range(8))}
 TILT = {"key": "spike.vertex_positions", "direction": [0, 1, 0.7], "vertices": [1, 2, 3, 4]}
+BALL_SLIDES = {"key": "ball.to_world", "direction": [1, 0, 0.3]}
+BALL_SINKS = {"key": "ball.to_world", "direction": [0, -1, 0]}
+AXIS = {"key": "axis.to_world", "rotate": [0.3, 0.2, 1]}
+BULB = {"key": "bulb.to_world", "direction": [0.3, 1, 0]}
 
 #: Of each case: scene, motion, step, max_depth.
 CUTS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
@@ -104,4 +144,14 @@ CUTS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "cut_lamp": (cut_lamp, BOARD, 6e-3, 2),
     "knot": (knot, DEFORM, 4e-3, 2),
     "spike": (spike, TILT, 4e-3, 2),
+}
+
+#: The same, where spheres, disks and cylinders are cut.
+CURVES: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
+    "sunk_sphere_slides": (sunk_sphere, BALL_SLIDES, 3e-3, 2),
+    "sunk_sphere_floor": (sunk_sphere, RISE, 3e-3, 2),
+    "sunk_sphere_camera": (sunk_sphere, CAMERA, 3e-3, 2),
+    "sunk_sphere_light": (sunk_sphere, BALL_SINKS, 3e-3, 3),
+    "pillar_turns": (pillar, AXIS, 4e-3, 2),
+    "cut_bulb": (cut_bulb, BULB, 4e-3, 2),
 }

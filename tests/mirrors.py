@@ -97,13 +97,18 @@ def smooth_mirror(textured: bool = False, flipped: bool = False) -> mi.Scene:
     return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), sky=constant(0.5))
 
 
-def mirrored_cut() -> mi.Scene:
-    """A cube that stands in a floor, before a mirror that shows its back."""
+def mirrored_cut(thing: dict | None = None) -> mi.Scene:
+    """A cube, or another thing, that stands in a floor, before a mirror that shows its back."""
     wall = quad((-2, -1, 1.1), (0, 3, 0), (4, 0, 0.4), "mirror", bsdf={"type": "conductor"})
     floor = horizontal((0, 0.25, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
     at = camera((0.6, 1.9, -3.4), (0.1, 0.6, 0.6))
-    thing = cube((0.1, 0.4, 0))
-    return scene(sensor=at, cube=thing, floor=floor, mirror=wall, sky=constant(0.5))
+    things = {"cube": cube((0.1, 0.4, 0))} if thing is None else {"ball": thing}
+    return scene(sensor=at, **things, floor=floor, mirror=wall, sky=constant(0.5))
+
+
+def mirrored_cut_sphere() -> mi.Scene:
+    """A sphere that stands in a floor, before such a mirror."""
+    return mirrored_cut({"type": "sphere", "center": [0.1, 0.45, 0], "radius": 0.5, "bsdf": diffuse(0.8, 0.5, 0.3)})
 
 
 # ---------------------- Textures that jump ----------------------
@@ -247,6 +252,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "mirror_camera": (over_mirror, CAMERA, 2e-3, 2),
     "two_mirrors": (two_mirrors, TURN, 3e-3, 4),
     "mirrored_cut": (mirrored_cut, SLIDE, 3e-3, 3),
+    "mirrored_cut_sphere": (mirrored_cut_sphere, {"key": "ball.to_world", "direction": [1, 0.4, 0.3]}, 3e-3, 3),
     "pane": (pane, SLIDE, 2e-3, 5),
     "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),

@@ -233,8 +233,14 @@ MUTANTS = [
     mutant(
         "film boundary: lines in which meshes cut each other count where something hides them",
         "edge_sampling/geometry/device_edges.py",
-        "return dr.select(line, self._is_hidden_line(p, rays, met), hidden) if self._any_lines else hidden",
-        "return hidden & ~line",
+        "dr.select(line, self._is_hidden_line(positions, edge, p, rays, met), hidden) if self._any_lines else hidden",
+        "hidden & ~line",
+    ),
+    mutant(
+        "film boundary: curves in which spheres cut other shapes follow one of both only",
+        "edge_sampling/geometry/cut_curves.py",
+        "surfaces = [s.distance(mi.Vector3d(p)) for s in pairs.surfaces(positions)]",
+        "surfaces = [s.distance(mi.Vector3d(p)) for s in (pairs.surfaces(positions)[0], pairs.surfaces(still)[1])]",
     ),
     mutant(
         "film boundary: silhouettes that lie exactly behind others count",

@@ -26,7 +26,7 @@ MORE_CASES = (
     "led_moves distant_cube discs_lights discs_radius smooth_torus_sun sphere_sun sphere_light surroundings "
     "reflecting_ball light_out_of_frame sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
     "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
-    "hidden_picture box_behind_glass spike stretched_ball lampshade_wall"
+    "hidden_picture box_behind_glass spike stretched_ball lampshade_wall sunk_sphere_slides pillar_turns"
 )
 
 #: Slow tests, by how their names begin.
@@ -109,14 +109,17 @@ test_convergence.py::test_error_falls_with_samples[smooth_torus_sun]
 test_balance.py::test_derivatives_stay_the_same[open_air
 test_convergence.py::test_error_falls_with_samples[sphere_soft]
 test_convergence.py::test_error_falls_with_samples[thin_lens_camera]
-test_cuts.py::test_frozen_functions[prb_edge]
+test_cuts.py::test_frozen_functions[sunk_cube-cube.vertex_positions-prb_edge]
+test_cuts.py::test_frozen_functions[pillar-floor.vertex_positions-prb_edge]
 test_instances.py::test_frozen_functions[thing.to_world-prb_edge]
 test_instances.py::test_frozen_functions[floor.vertex_positions-prb_edge]
 test_instances.py::test_instances_that_stand_still_equal_meshes[lamp.vertex_positions]
 test_instances.py::test_instances_that_move_equal_meshes[2]
-test_cuts.py::test_gradients_are_those_of_forward_mode[cube.vertex_positions-prb_edge]
-test_cuts.py::test_gradients_are_those_of_forward_mode[floor.vertex_positions-prb_edge]
-test_cuts.py::test_gradients_are_those_of_forward_mode[sensor.to_world-prb_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[sunk_cube-cube.vertex_positions-prb_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[sunk_cube-floor.vertex_positions-prb_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[sunk_cube-sensor.to_world-prb_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[sunk_sphere-ball.to_world-prb_edge]
+test_cuts.py::test_gradients_are_those_of_forward_mode[sunk_sphere-floor.vertex_positions-prb_edge]
 test_direct_edge.py::test_forward_and_backward_agree[crop_window]
 test_direct_edge.py::test_forward_and_backward_agree[cube_depth]
 test_direct_edge.py::test_forward_and_backward_agree[thin_lens_camera]

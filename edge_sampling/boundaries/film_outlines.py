@@ -92,13 +92,13 @@ class FilmOutlines:
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool, seams: bool):
         self.geometry, self.soft = geometry, soft
         self.lines = geometry.lines
-        cut = geometry.lines is not None and bool(moving[list(geometry.lines.meshes)].any())
-        edges, faces = edges.of_meshes(moving, lines=cut), geometry.faces(moving)
-        # (Dr.Jit 1.5 cannot freeze empty arrays.)
+        edges, faces = edges.of_meshes(moving, lines=geometry.any_line(moving)), geometry.faces(moving)
+        # (Dr.Jit 1.5 cannot freeze empty arrays: if curves alone move, one face without area stands for all.)
+        faces = faces if len(faces) else np.zeros((1, 3), np.uint32)
         self.edges = DeviceEdges(edges, geometry) if len(edges) else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
         #: Which edges are on meshes that reflect light from all directions, but from behind?
-        spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes])
+        spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes] or [False])
         self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
         #: And which on meshes that are matt?
         matt = np.array([m.bsdf() is not None and is_matt(m.bsdf()) for m in geometry.meshes])[edges.mesh].all(1)
@@ -156,6 +156,10 @@ class FilmOutlines:
             visible = projection.clip(a, b)
             found.t, dt = visible.parameter(chosen.along)
             found.along_film = projection.tangent(a, b, found.t, lens) * dt
+            if self.edges.curves is not None:
+                curved, p, along = self.edges.on_curve(at.positions, chosen.edge, found.t)
+                on_film = projection.tangent(p, mi.Point3f(p + along), mi.Float(0), lens) * dt
+                found.along_film = dr.select(chosen.is_edge & curved, on_film, found.along_film)
             found.valid = chosen.is_line & (visible.length > 0)
         if self.curves is not None:
             found.eye = -projection.view() if projection.orthographic else projection.eye(lens)
@@ -177,6 +181,9 @@ class FilmOutlines:
         p = mi.Point3f(0)
         if self.edges is not None:
             p = dr.lerp(*self._end_points(at, chosen.index), found.t)
+            if self.edges.curves is not None:
+                curved, on_curve, _ = self.edges.on_curve(at.positions, chosen.edge, found.t)
+                p = dr.select(chosen.is_edge & curved, on_curve, p)
         if self.curves is not None:
             p = dr.select(chosen.is_curve, self._curve_point(at, chosen, found).p, p)
         if self.horizons is not None:

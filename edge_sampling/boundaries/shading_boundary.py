@@ -75,9 +75,9 @@ class ShadingBoundary:
         lamps = [e.get_shape() for e in scene.emitters() if e.flags() & mi.EmitterFlags.Surface]
         self.bent_lamps = [mi.ShapePtr(s) for s in lamps if is_bent(s)]
         emitters = scene.emitters()
-        #: Do meshes cut through lamps? That is no shadow, which would be found from the lamp.
-        lines = silhouettes.lines
-        self.cut_lamps = lines is not None and any(geometry.meshes[i].is_emitter() for i in lines.meshes)
+        #: Do shapes cut through lamps? That is no shadow, which would be found from the lamp.
+        shapes = (*geometry.meshes, *geometry.analytic)
+        self.cut_lamps = any(shapes[i].is_emitter() for lines in geometry.lines for i in lines.shapes)
         #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
         lights = [i for i, e in enumerate(emitters) if not e.flags() & mi.EmitterFlags.Delta]
         self.lights = mi.UInt32(lights or [0])  # Dr.Jit 1.5 cannot freeze empty arrays
@@ -297,7 +297,7 @@ class ShadingBoundary:
         """The side of an edge on which its faces are not, 1 or −1 along `across`; 0 if they are on both. And `n_dl`,
         which is twice as large where one of two sides is looked at."""
         outward = outline.outward(across, ω)
-        if self.silhouettes.lines is None:
+        if not self.silhouettes.lines:
             return outward, n_dl
         # Beside a line in which meshes cut through each other, both sides slide past it. One of them is looked at, by
         # chance.

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.geometry.device_edges import rounding
 from rimlight.edge_sampling.parametrisation import material_point
 
 #: Barycentric coordinate from which on a point is taken to lie inside of a triangle.
@@ -30,7 +31,7 @@ class Touch:
 
     n : mi.Vector3f, across ray and outline. t : mi.Float, distance along the ray. Detached.
     moved : mi.Float, n · q, attached to the shapes.
-    cut : mi.Bool, is it a line in which a mesh cuts another surface?
+    cut : mi.Bool, is it a line in which two surfaces cut each other?
     """
 
     n: mi.Vector3f
@@ -53,13 +54,14 @@ def touch_outline(
     reach : about how far the two are apart there, scene units.
     """
     is_mesh = near[1].shape.is_mesh() | (near[1].instance != None)  # noqa: E711
-    on_mesh = _of_mesh(ray, near, far, active & is_mesh)
-    if all(s.is_mesh() for s in scene.shapes()):
-        return on_mesh
-    on_curved = _of_curved(scene, ray, near, reach, active & ~is_mesh)
+    outline = _of_mesh(ray, near, far, active & is_mesh)
+    if not all(s.is_mesh() for s in scene.shapes()):
+        on_curved = _of_curved(scene, ray, near, far, reach, active & ~is_mesh)
+        with dr.resume_grad():
+            outline = dr.select(is_mesh, outline, on_curved)
+    of_cut = _of_cut(ray, near, far, outline.cut)
     with dr.resume_grad():
-        both = (dr.select(is_mesh, getattr(on_mesh, k), getattr(on_curved, k)) for k in ("n", "t", "moved"))
-        return Touch(*both, on_mesh.cut)
+        return dr.select(outline.cut, of_cut, outline)
 
 
 def _of_mesh(ray, near, far, active) -> Touch:
@@ -92,12 +94,10 @@ def _of_mesh(ray, near, far, active) -> Touch:
     with dr.resume_grad():
         moved = dr.dot(across, dr.lerp(of_edge(corners, 1), of_edge(corners, 2), λ))
     cut = active & far[1].is_valid() & (least > INSIDE * dr.squared_norm(n))
-    of_cut = _of_cut(ray, near, far, cut)
-    with dr.resume_grad():
-        return Touch(*(dr.select(cut, a, b) for a, b in zip(of_cut, (across, t, moved), strict=True)), cut)
+    return Touch(across, t, moved, cut)
 
 
-def _of_cut(ray, near, far, active) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+def _of_cut(ray, near, far, active) -> Touch:
     with dr.resume_grad():
         a, b = (material_point(*side, active) for side in (near, far))
     n, m = mi.Vector3f(dr.detach(a.n)), mi.Vector3f(dr.detach(b.n))
@@ -106,14 +106,20 @@ def _of_cut(ray, near, far, active) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
     parallel = 1 - c * c <= 0
     α, β = ((x - c * y) / dr.select(parallel, 1, 1 - c * c) for x, y in ((along_n, along_m), (along_m, along_n)))
     with dr.resume_grad():
-        return across, dr.dot(dr.detach(a.p) - ray.o, ray.d), α * dr.dot(n, a.p) + β * dr.dot(m, b.p)
+        moved = α * dr.dot(n, a.p) + β * dr.dot(m, b.p)
+        return Touch(across, dr.dot(dr.detach(a.p) - ray.o, ray.d), moved, active)
 
 
-def _of_curved(scene, ray, near, reach, active) -> Touch:
+def _of_curved(scene, ray, near, far, reach, active) -> Touch:
+    """At the contour or a rim of a shape that is no mesh, or where another surface cuts it: that is then met in its
+    tangent plane."""
     near_ray, pi = near
     with dr.resume_grad():
         si = material_point(near_ray, pi, active, mi.RayFlags.All)
     at = dr.detach(si)
+    other = far[1].compute_surface_interaction(far[0], mi.RayFlags.Minimal, active)
+    in_plane = dr.abs_dot(at.n, other.p - at.p) <= 4 * reach + rounding(at.p, ray.o)
+    cut = active & other.is_valid() & (other.shape != at.shape) & in_plane
     # Along the contour, what turns away from the viewer ends; a rim has a tangent of its own.
     tangent = dr.cross(at.n, ray.d)
     for shape in scene.shapes():
@@ -126,7 +132,7 @@ def _of_curved(scene, ray, near, reach, active) -> Touch:
             tangent = dr.select(rim, at.dp_du, tangent)
     across = _unit(dr.cross(tangent, ray.d))
     with dr.resume_grad():
-        return Touch(across, dr.dot(at.p - ray.o, ray.d), dr.dot(across, si.p), mi.Bool(False))
+        return Touch(across, dr.dot(at.p - ray.o, ray.d), dr.dot(across, si.p), cut)
 
 
 def _unit(v: mi.Vector3f) -> mi.Vector3f:

@@ -40,7 +40,7 @@ class OutlinePoint:
     p : mi.Point3f, world space; attached to its placement.
     tangent : mi.Vector3f, dp/dt, where t is the parameter that was sampled. Detached.
     inwards : two vectors from p towards the faces on the two sides of an edge. Detached.
-    is_line : is it on a line in which meshes cut through each other? Then both faces go on beyond it.
+    is_line : is it on a line in which shapes cut through each other? Then both faces go on beyond it.
     """
 
     p: mi.Point3f
@@ -84,7 +84,7 @@ class Silhouettes:
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
         self.geometry = geometry
-        #: In which meshes cut through each other; they are the last edges.
+        #: In which shapes cut through each other; they are the last edges.
         self.lines = geometry.lines
         self.count = len(edges)
         self._first_line = dr.opaque(mi.UInt32, self.count - int(edges.is_line.sum()))
@@ -226,8 +226,12 @@ class Silhouettes:
             p = dr.lerp(a, b, sample.t)
             with dr.suspend_grad():
                 inwards = tuple(dr.detach(o - p) for o in edges.opposite(placement.positions, index))
-                is_line = index >= self._first_line if self.lines is not None else mi.Bool(False)
+                is_line = index >= self._first_line if self.lines else mi.Bool(False)
                 point = OutlinePoint(p, dr.detach(b - a), inwards, is_line)
+            if edges.curves is not None:
+                curved, on_curve, tangent = edges.on_curve(placement.positions, index, sample.t)
+                point.p = dr.select(curved, on_curve, point.p)
+                point.tangent = dr.select(curved, tangent, point.tangent)
             if self.curves is None:
                 return point
         piece = sample.edge - self.count

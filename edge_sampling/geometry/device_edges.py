@@ -41,8 +41,8 @@ class DeviceEdges:
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
     _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
-    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_through")
-    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", *_ANY, *_OF_EDGES))
+    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_through", "_first_line")
+    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
         # Copied, since Dr.Jit maps NumPy's memory: two arrays on the same memory make `dr.freeze` record anew.
@@ -57,12 +57,16 @@ class DeviceEdges:
         self._two_faces = mi.Bool(edges.count == 2)
         self._few_faces = mi.Bool(edges.count <= 2)
         self._is_line = mi.Bool(np.array(edges.is_line))
-        glass, mask = (np.array([is_so(m) for m in geometry.meshes])[edges.mesh].any(1) for is_so in KINDS)
+        glass, mask = (np.array([is_so(m) for m in geometry.meshes] or [False])[edges.mesh].any(1) for is_so in KINDS)
         self._glass, self._mask = mi.Bool(glass & ~edges.is_line), mi.Bool(mask & ~edges.is_line)
         #: Is there an edge beside which `farther` is not 0?
         self.any_farther = bool((glass | mask | edges.is_line).any())
-        #: Are there lines in which meshes cut through each other?
+        #: Are there lines in which shapes cut through each other?
         self._any_lines = bool(edges.is_line.any())
+        #: The curves among them, which come first.
+        curves = [lines for lines in geometry.lines if not lines.straight] if self._any_lines else []
+        self.curves = curves[0] if curves else None
+        self._first_line = int(np.argmax(edges.is_line)) if self._any_lines else 0
         shapes = (*geometry.meshes, *geometry.analytic, *geometry.others)
         #: Is there a surface that lets rays through?
         self._any_through = any(lets_rays_through(s) for s in shapes)
@@ -78,6 +82,17 @@ class DeviceEdges:
 
     def _points_of_side(self, positions, edge, side):
         return (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, self._ends[side][k], edge)) for k in (0, 1))
+
+    def on_curve(self, positions: mi.Float, edge: mi.UInt32, t: mi.Float) -> tuple[mi.Bool, mi.Point3f, mi.Vector3f]:
+        """Which edges are pieces of curves; their points t, world space, attached, and the derivatives with respect to
+        t, detached."""
+        curved, piece = self._piece(edge)
+        return curved, *self.curves.point(positions, piece, t)
+
+    def _piece(self, edge: mi.UInt32) -> tuple[mi.Bool, mi.UInt32]:
+        """Which edges are pieces of curves, and which ones."""
+        curved = (edge >= self._first_line) & (edge < self._first_line + self.curves.capacity)
+        return curved, dr.select(curved, edge - self._first_line, 0)
 
     def normals(self, positions: mi.Float, edge: mi.UInt32) -> list[mi.Vector3f]:
         """Normals of the faces on both sides, not normalised.
@@ -127,13 +142,19 @@ class DeviceEdges:
         line = dr.gather(mi.Bool, self._is_line, edge)
         covered = dr.gather(mi.Bool, self._few_faces, edge) & (covers[0] | covers[1])
         hidden = dr.select(fold, ~(shown[0] & shown[1]), covered & ~(shown[0] | shown[1]))
-        return dr.select(line, self._is_hidden_line(p, rays, met), hidden) if self._any_lines else hidden
+        return (
+            dr.select(line, self._is_hidden_line(positions, edge, p, rays, met), hidden) if self._any_lines else hidden
+        )
 
-    def _is_hidden_line(self, p: mi.Point3f, rays, met) -> mi.Bool:
-        """Does one of two rays beside a line in which meshes cut through each other miss both?"""
+    def _is_hidden_line(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, rays, met) -> mi.Bool:
+        """Does one of two rays beside a line in which shapes cut through each other miss both?"""
         missed = mi.Bool(False)
         for ray, si in zip(rays, met, strict=True):
-            there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o)
+            slack = rounding(p, ray.o)
+            there = dr.abs_dot(si.n, p - si.p) <= slack
+            if self.curves is not None:
+                curved, piece = self._piece(edge)
+                there = dr.select(curved, self.curves.is_met(positions, piece, p, ray.d, si.p, slack), there)
             missed |= ~(si.is_valid() & there) & ~self._lets_through(si)
         return missed
 

@@ -45,8 +45,8 @@ class Edges:
     mesh     : (E, 2), uint32; index into `Geometry.meshes` of the face on each side.
     kind     : (E,), uint8; an `EdgeKind`.
     count    : (E,), uint32; number of faces.
-    is_line  : (E,), bool; is it a line in which meshes cut through each other (`Intersections`)? Its vertices are not
-               those of a mesh, its mesh is not told, and its faces do not end there.
+    is_line  : (E,), bool; is it a line in which shapes cut through each other (`Intersections`, `CutCurves`)? Its
+               vertices are not those of a mesh, its mesh is not told, and its faces do not end there.
 
     The end points of the first side are in the order in which its face runs through them.
     """

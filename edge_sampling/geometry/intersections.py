@@ -13,6 +13,7 @@ either side is *not* fixed to the line, as it is to an edge: both surfaces slide
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import drjit as dr
@@ -76,6 +77,9 @@ class Intersections:
 
     DRJIT_STRUCT = dict.fromkeys(("corners",))  # for `dr.freeze`
 
+    #: Are its lines straight?
+    straight = True
+
     def __init__(self, scene: mi.Scene, geometry: Geometry, edges: Edges, weld: Weld):
         self._edges, self._place = edges, _index(weld.place)
         faces = geometry.faces((True,) * len(geometry.meshes))
@@ -88,13 +92,13 @@ class Intersections:
         #: Where the meshes were (held, so that the number of an array is given to no other one).
         self._at: list[mi.Float] | None = None
         self.count = self.capacity = 0
-        #: Which may cut each other, since their boxes overlap: their numbers.
-        self.meshes: tuple[int, ...] = ()
+        #: Meshes that may cut each other, since their boxes overlap: their numbers.
+        self.shapes: tuple[int, ...] = ()
         #: Six vertices of each pair of triangles: (capacity,) each.
         self.corners: list[mi.UInt32] = []
         #: Meshes that cut through themselves. Others may come to do so when their shapes change.
         self._by_themselves: set[int] = set()
-        self._shapes = Shapes(geometry)
+        self._forms = Shapes(geometry)
 
     # ---------------------- Search ----------------------
 
@@ -105,14 +109,14 @@ class Intersections:
         if self._at is not None and all(a.index == b.index for a, b in zip(arrays, self._at, strict=True)):
             return False
         self._at = arrays
-        before = self.meshes, self.capacity
+        before = self.shapes, self.capacity
         boxes = _overlapping(geometry)
         with dr.suspend_grad():
-            alone = self._shapes.changed(arrays) | self._by_themselves
+            alone = self._forms.changed(arrays) | self._by_themselves
             everywhere = {i: np.array([[-np.inf] * 3, [np.inf] * 3]) for i in alone}
-            self._search(scene, dr.detach(replace(geometry, lines=None).positions()), boxes | everywhere)
-        self.meshes = tuple(sorted(boxes.keys() | self._by_themselves))
-        return bool(self.capacity) and before != (self.meshes, self.capacity)
+            self._search(scene, dr.detach(replace(geometry, lines=()).positions()), boxes | everywhere)
+        self.shapes = tuple(sorted(boxes.keys() | self._by_themselves))
+        return bool(self.capacity) and before != (self.shapes, self.capacity)
 
     def _search(self, scene: mi.Scene, positions: mi.Float, boxes: dict[int, np.ndarray]) -> None:
         """Find the pairs, and which meshes cut through themselves. boxes : meshes, and where to look for what cuts
@@ -136,6 +140,8 @@ class Intersections:
             cutting = dr.compress(counts > 0)
             start = dr.gather(mi.UInt32, ends - counts, cutting)
             self._walk(scene, positions, walked.take(cutting), within, into=found, start=start)
+            found = _each_once(found)
+            count = dr.width(found[0])
         self._keep(found, count)
 
     def _keep(self, found: list[mi.UInt32], count: int) -> None:
@@ -231,9 +237,13 @@ class Intersections:
         """Number of the vertices that stand for the lines."""
         return VERTICES * self.capacity
 
-    def points(self, positions: mi.Float) -> list[mi.Point3f]:
+    def points(self, of_meshes: list[mi.Float]) -> list[mi.Point3f]:
         """The vertices of all lines, first their lower ends, then their upper ends, then points of the first triangle's
-        plane on both sides: `VERTICES` times (capacity,), world space; attached to `positions`, (3 V,)."""
+        plane on both sides: `VERTICES` times (capacity,), world space; attached.
+
+        of_meshes : positions of the vertices of each mesh, (3 V,).
+        """
+        positions = dr.concat(of_meshes)
         corners = [dr.gather(mi.Point3f, positions, c) for c in self.corners]
         first, second = corners[:3], corners[3:]
         with dr.suspend_grad():
@@ -249,19 +259,35 @@ class Intersections:
 
         vertices : number of those of all meshes, after which those of the lines come.
         """
-        n = self.capacity
-        k = np.arange(n, dtype=np.uint32) + np.uint32(vertices)
-        ends = np.stack([k, k + n], 1)
-        lines = Edges(
-            vertices=np.stack([ends, ends], 1),
-            opposite=np.stack([k + 2 * n, k + 3 * n], 1),
-            mesh=np.zeros((n, 2), np.uint32),
-            kind=np.full(n, EdgeKind.JUMP, np.uint8),
-            count=np.full(n, 4, np.uint32),
-            is_line=np.ones(n, bool),
-        )
-        both = lambda name: np.concatenate([getattr(edges, name), getattr(lines, name)])
-        return Edges(*(both(f.name) for f in fields(Edges)))
+        return line_edges(edges, self.capacity, vertices)
+
+
+def line_edges(edges: Edges, n: int, vertices: int) -> Edges:
+    """`edges`, and after them n lines in which shapes cut each other, as edges that are boundaries from everywhere.
+
+    vertices : number of those before the first ends of all lines, after which come the second ends, and points on both
+        sides.
+    """
+    k = np.arange(n, dtype=np.uint32) + np.uint32(vertices)
+    ends = np.stack([k, k + n], 1)
+    lines = Edges(
+        vertices=np.stack([ends, ends], 1),
+        opposite=np.stack([k + 2 * n, k + 3 * n], 1),
+        mesh=np.zeros((n, 2), np.uint32),
+        kind=np.full(n, EdgeKind.JUMP, np.uint8),
+        count=np.full(n, 4, np.uint32),
+        is_line=np.ones(n, bool),
+    )
+    both = lambda name: np.concatenate([getattr(edges, name), getattr(lines, name)])
+    return Edges(*(both(f.name) for f in fields(Edges)))
+
+
+def _each_once(found: list[mi.UInt32]) -> list[mi.UInt32]:
+    """Pairs of triangles, each once: where the edges of two meshes meet, both find the pair from the same end."""
+    corners = np.stack([f.numpy() for f in found], 1).reshape(-1, 3)
+    triangle = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)[1].reshape(-1, 2)
+    first = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True)[1]
+    return [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)]
 
 
 def common_line(first: list[mi.Point3f], second: list[mi.Point3f]) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
@@ -317,13 +343,21 @@ def _normal(triangle: list[mi.Point3f]) -> mi.Vector3f:
 
 
 def _follow(p: mi.Point3f, first: list[mi.Point3f], second: list[mi.Point3f], active: mi.Bool) -> mi.Point3f:
-    """The point p of the line, attached: it stays in both planes."""
+    """The point p of the line, attached to both triangles."""
     normals, heights = [], []
     for triangle in (first, second):
         n = _normal(triangle)
         g = dr.dot(n, p - triangle[0])
         normals.append(dr.detach(n))
         heights.append(dr.select(active, g - dr.detach(g), 0))
+    return stay_on(p, normals, heights, active)
+
+
+def stay_on(p: mi.Point3f, normals: Sequence, heights: Sequence, active: mi.Bool) -> mi.Point3f:
+    """The point p of two surfaces, attached: it moves in the plane of their normals, so that it stays on both.
+
+    normals : of unit length, detached. heights : over both surfaces, zero, with the gradient for a fixed p.
+    """
     (n, m), (g, h) = normals, heights
     cosine = dr.dot(n, m)
     determinant = dr.select(active, 1 - dr.square(cosine), 1)

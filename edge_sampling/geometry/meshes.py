@@ -35,14 +35,14 @@ class Geometry:
     analytic : spheres, disks, cylinders, whose outlines are known curves.
     others : all else (hair, ...; instances, until `Instances` finds their meshes). They occlude and receive light, but
         must not move.
-    lines : in which the meshes cut through each other (`Intersections`), whose vertices then come after those of the
-        meshes; None: there are none.
+    lines : in which shapes cut through each other (`CutCurves`, `Intersections`), whose vertices then come after those
+        of the meshes.
     """
 
     meshes: tuple[Any, ...]
     analytic: tuple[Any, ...] = ()
     others: tuple[Any, ...] = ()
-    lines: Any = None
+    lines: tuple[Any, ...] = ()
 
     @staticmethod
     def of(scene: mi.Scene) -> Geometry:
@@ -55,7 +55,11 @@ class Geometry:
     @property
     def line_vertices(self) -> int:
         """Number of the vertices of `lines`."""
-        return self.lines.vertices if self.lines is not None else 0
+        return sum(lines.vertices for lines in self.lines)
+
+    def any_line(self, wanted: np.ndarray) -> bool:
+        """Can one of the shapes for which `wanted` (bool, laid out as `moving`) holds have lines?"""
+        return any(bool(wanted[list(lines.shapes)].any()) for lines in self.lines)
 
     def faces(self, wanted: tuple[bool, ...]) -> np.ndarray:
         """Faces of the meshes that are `wanted`: (F, 3), indices into `positions`, on the host."""
@@ -88,14 +92,14 @@ class Geometry:
 
     def positions(self) -> mi.Float:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
-        positions = _concat([positions_of(m) for m in self.meshes])
-        if self.lines is None:
-            return positions
-        return dr.concat([positions, *(dr.ravel(p) for p in self.lines.points(positions))])
+        of_meshes = [positions_of(m) for m in self.meshes]
+        if not self.lines:
+            return _concat(of_meshes)
+        return dr.concat([*of_meshes, *(dr.ravel(p) for lines in self.lines for p in lines.points(of_meshes))])
 
     def host_positions(self) -> np.ndarray:
         """Vertex positions of all meshes: (V, 3), world space, on the host."""
-        if self.lines is not None:
+        if self.lines:
             with dr.suspend_grad():
                 return np.array(self.positions()).reshape(-1, 3)
         return np.concatenate([vertices(m) for m in self.meshes]) if self.meshes else np.zeros((0, 3), np.float32)
@@ -104,7 +108,7 @@ class Geometry:
         """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Attached."""
         none = lambda count: dr.zeros(mi.Float, 3 * count)
         normals = [normals_of(m) if has_interpolated_normals(m) else none(m.vertex_count()) for m in self.meshes]
-        return _concat([*normals, none(self.line_vertices)] if self.lines is not None else normals)
+        return _concat([*normals, none(self.line_vertices)] if self.lines else normals)
 
 
 # ---------------------- Arrays, in both interfaces; attached where those of the mesh are ----------------------

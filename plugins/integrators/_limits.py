@@ -20,8 +20,8 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
-from rimlight.edge_sampling.geometry.cut_curves import cut_curves
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
+from rimlight.edge_sampling.geometry.other_cuts import cuts_of_others
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
@@ -180,12 +180,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, edges: Edges, moving: Moving) 
             "them by meshes."
         )
     moves = lambda s: s in moving.on_film
-    cut = sorted({tuple(sorted((a.id(), b.id()))) for a, b in cut_curves(scene, geometry) if moves(a) or moves(b)})
+    cut = sorted({tuple(sorted((a.id(), b.id()))) for a, b in cuts_of_others(scene, geometry) if moves(a) or moves(b)})
     if cut:
         pairs = ", ".join(f'"{a}" and "{b}"' for a, b in cut)
         limits.append(
-            "the derivative lacks the curves in which spheres, disks and cylinders cut through other shapes: "
-            f"{pairs}. Replace them by meshes."
+            "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
+            f"such nor meshes: {pairs}. Replace them by meshes."
         )
     # Of edges that lie on one another, those of what stands still have no velocity, and do not count.
     twice = sorted(

@@ -11,6 +11,7 @@ import numpy as np
 from rimlight._collection import collect_before
 from rimlight._plan import names
 from rimlight.edge_sampling import (
+    CutCurves,
     Edges,
     FacePlanes,
     FilmBoundary,
@@ -65,6 +66,7 @@ class BoundarySearch:
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
         self._instances = Instances()
+        self._curves: CutCurves | None = None
         self._lines: Intersections | None = None
         self._sources: Sources | None = None
         self._checked = False
@@ -123,11 +125,12 @@ class BoundarySearch:
             return
         self._refuse_while_recording()
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
-        self.geometry = self.edges = self._lines = self._sources = self._partial = self._media = None
+        self.geometry = self.edges = self._curves = self._lines = self._sources = self._partial = self._media = None
         self._boundaries, self._beyond, self._maps, self._bent = {}, {}, [], []
         collect_before()
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
+        self._curves = CutCurves(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
         self._sources = Sources(scene, found, geometry, self.edges, weld)
         self._partial, self._media = PartialParameters(scene), Media(scene)
@@ -135,17 +138,19 @@ class BoundarySearch:
         self._bent = [(s, o) for s in surfaces(scene) for o in objects_below(s).values() if hasattr(o, "turns")]
 
     def _find_lines(self, scene: mi.Scene) -> None:
-        """Find the lines in which the meshes cut through each other now."""
-        lines = self._lines
-        if lines.find(scene, self.geometry):
+        """Find the lines in which the shapes cut through each other now."""
+        changed = self._curves.find(self.geometry), self._lines.find(scene, self.geometry)
+        if any(changed):
+            lines = tuple(lines for lines in (self._curves, self._lines) if lines.capacity)
             self.geometry, self._boundaries = replace(self.geometry, lines=lines), {}
             collect_before()
 
     @property
     def _edges_and_lines(self) -> Edges:
-        lines = self.geometry.lines
-        count = sum(m.vertex_count() for m in self.geometry.meshes)
-        return self.edges if lines is None else lines.as_edges(self.edges, count)
+        edges, count = self.edges, sum(m.vertex_count() for m in self.geometry.meshes)
+        for lines in self.geometry.lines:
+            edges, count = lines.as_edges(edges, count), count + lines.vertices
+        return edges
 
     def _refuse_while_recording(self) -> None:
         if dr.flag(dr.JitFlag.FreezingScope):

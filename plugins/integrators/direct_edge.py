@@ -44,7 +44,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
 
     **Limits.** Only triangle meshes and their instances, spheres, disks and cylinders can move: moving hair is refused,
     and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and
-    cylinders cut through other shapes, or the far clipping plane through any, and shadows of hair, ... on
+    cylinders cut through such shapes, cuts of the far clipping plane through any, and shadows of hair, ... on
     what moves. Warned about, too: jumps at T-junctions, which count twice, and participating
     media, which are taken for empty (derivatives with respect to their parameters are refused). So is the light of
     smooth-shaded lamps with coarse meshes, which is off by some per cent. Polarised variants are refused. With

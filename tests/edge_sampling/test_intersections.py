@@ -26,7 +26,7 @@ def pieces(lines: Intersections, geometry: Geometry) -> np.ndarray:
     """Lower and upper ends of all lines: (N, 2, 3)."""
     if not lines.capacity:
         return np.zeros((0, 2, 3))
-    a, b, *_ = lines.points(geometry.positions())
+    a, b, *_ = lines.points([geometry.positions()])
     found = np.stack([np.array(a).T, np.array(b).T], 1)
     assert (found[lines.count :, 0] == found[lines.count :, 1]).all()  # space that is not needed
     return found[: lines.count]
@@ -94,13 +94,23 @@ def test_lines_end_where_one_of_the_meshes_does(turn):
     assert np.linalg.norm(found, axis=2).max() == pytest.approx(1, abs=1e-5)
 
 
+def test_lines_that_end_where_the_edges_of_both_meshes_meet():
+    """A wall as wide as the floor that it stands in."""
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5))
+    wall = quad((-2, -0.5, 0.9), (4, 0, 0), (0, 2.5, 0), "wall", bsdf=diffuse(0.5))
+    lines, geometry = intersections(scene(floor=floor, wall=wall))
+    found = pieces(lines, geometry)
+    assert len(found) == 3
+    assert length(found) == pytest.approx(4, rel=1e-5)
+
+
 def test_what_only_touches_does_not_cut():
     upright = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (0, 1) for x in (-0.5, 0.5)])
     box = mesh("box", upright, CUBE_FACES, bsdf=diffuse(0.5))
     beside = mesh("beside", np.add(upright, [1, 0, 0.2]), CUBE_FACES, bsdf=diffuse(0.5))
     floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5))
     lines, _ = intersections(scene(box=box, beside=beside, floor=floor))
-    assert lines.meshes == (0, 1, 2)  # their boxes touch
+    assert lines.shapes == (0, 1, 2)  # their boxes touch
     assert lines.capacity == lines.count == 0
 
 
@@ -143,7 +153,7 @@ def test_a_mesh_that_comes_to_cut_through_itself():
         one, other = np.split(corners(geometry.meshes[0]), 2)
         assert length(pieces(lines, geometry)) == pytest.approx(by_all_pairs(one, other).sum(), rel=1e-4)
         assert (lines.count > 0) == cuts
-        assert lines.meshes == ((0,) if cuts else ())
+        assert lines.shapes == ((0,) if cuts else ())
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -177,12 +187,12 @@ def test_lines_follow_the_planes_of_both_meshes():
     velocity = rng.normal(size=len(start)) * 0.3
 
     def ends(θ: float) -> np.ndarray:
-        a, b, *_ = lines.points(mi.Float((start + θ * velocity).astype(np.float32)))
+        a, b, *_ = lines.points([mi.Float((start + θ * velocity).astype(np.float32))])
         return np.stack([np.array(a).T, np.array(b).T], 1)[: lines.count].astype(float)
 
     θ = mi.Float(0)
     dr.enable_grad(θ)
-    attached = lines.points(mi.Float(start.astype(np.float32)) + θ * mi.Float(velocity.astype(np.float32)))[:2]
+    attached = lines.points([mi.Float(start.astype(np.float32)) + θ * mi.Float(velocity.astype(np.float32))])[:2]
     dr.forward(θ)
     moved = np.stack([np.array(dr.grad(p)).T for p in attached], 1)[: lines.count].astype(float)
     h = 1e-3
@@ -219,7 +229,7 @@ def test_lines_are_edges_after_all_others():
     both = lines.as_edges(edges, 8)
     assert both.is_line.sum() == lines.capacity
     assert not both.is_line[: len(edges)].any()
-    extended = replace(geometry, lines=lines)
+    extended = replace(geometry, lines=(lines,))
     assert dr.width(extended.positions()) == 3 * (8 + lines.vertices)
     assert len(extended.host_positions()) == 8 + lines.vertices == both.vertices.max() + 1 + 2 * lines.capacity
     assert dr.width(extended.normals()) == 3 * (8 + lines.vertices)

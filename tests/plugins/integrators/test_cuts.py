@@ -1,4 +1,4 @@
-"""Derivatives of meshes that cut through each other. Their references are in `test_derivatives.py`."""
+"""Derivatives of shapes that cut through each other. Their references are in `test_derivatives.py`."""
 
 from __future__ import annotations
 
@@ -15,15 +15,28 @@ INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
-@pytest.mark.parametrize("key", ["cube.vertex_positions", "floor.vertex_positions", "sensor.to_world"])
-def test_gradients_are_those_of_forward_mode(name, key):
-    scene, made = cuts.sunk_cube(), mi.load_dict(INTEGRATORS[name])
+@pytest.mark.parametrize(
+    ("of", "key"),
+    [
+        (cuts.sunk_cube, "cube.vertex_positions"),
+        (cuts.sunk_cube, "floor.vertex_positions"),
+        (cuts.sunk_cube, "sensor.to_world"),
+        (cuts.sunk_sphere, "ball.to_world"),
+        (cuts.sunk_sphere, "floor.vertex_positions"),
+        (cuts.pillar, "knob.to_world"),
+    ],
+)
+def test_gradients_are_those_of_forward_mode(name, of, key):
+    scene, made = of(), mi.load_dict(INTEGRATORS[name])
     assert_backward_is_forward(scene, made, Motion(scene, key, direction=[1, 0.4, 0.2]))
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
-def test_frozen_functions(name):
-    assert_frozen_is_unfrozen(cuts.sunk_cube(), mi.load_dict(INTEGRATORS[name]), "cube.vertex_positions")
+@pytest.mark.parametrize(
+    ("of", "key"), [(cuts.sunk_cube, "cube.vertex_positions"), (cuts.pillar, "floor.vertex_positions")]
+)
+def test_frozen_functions(name, of, key):
+    assert_frozen_is_unfrozen(of(), mi.load_dict(INTEGRATORS[name]), key)
 
 
 def assert_same(scene: mi.Scene, used: mi.Integrator, motion: dict) -> None:
@@ -44,6 +57,16 @@ def test_lines_are_not_kept_when_meshes_part():
         assert_same(scene, used, cuts.SLIDE)
 
 
+def test_curves_are_not_kept_when_shapes_part():
+    scene, used = cuts.sunk_sphere(), mi.load_dict(INTEGRATORS["direct_edge"])
+    params, key = mi.traverse(scene), "ball.to_world"
+    still = mi.Transform4f(params[key])
+    for height in (0, 0.8, 0.1, 0):
+        params[key] = mi.Transform4f().translate([0, height, 0]) @ still
+        params.update()
+        assert_same(scene, used, cuts.BALL_SLIDES)
+
+
 def test_a_mesh_that_comes_to_cut_through_itself():
     scene, used = cuts.knot(), mi.load_dict(INTEGRATORS["direct_edge"])
     params, key = mi.traverse(scene), "knot.vertex_positions"
@@ -52,4 +75,4 @@ def test_a_mesh_that_comes_to_cut_through_itself():
         params[key] = together - mi.Float([shift, 0, 0] * 8 + [0, 0, 0] * 8)
         params.update()
         assert_same(scene, used, cuts.DEFORM)
-        assert (used.search.geometry.lines is None) == (shift == 1)
+        assert (not used.search.geometry.lines) == (shift == 1)

@@ -87,7 +87,7 @@ def test_lines_in_which_an_instance_cuts_through_a_mesh():
         found.append((made.search._lines, made.search.geometry))
     lengths = []
     for lines, geometry in found:
-        lower, upper, *_ = lines.points(geometry.positions())
+        lower, upper, *_ = lines.points([geometry.positions()])
         lengths.append(dr.sum(dr.norm(upper - lower))[0])
     assert found[0][0].count == found[1][0].count > 8
     assert lengths[0] == pytest.approx(lengths[1], rel=1e-3)

@@ -228,16 +228,21 @@ def test_scenes_far_from_the_origin(distance):
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk"])
 @pytest.mark.parametrize("height", [-0.3, 0.0, 0.2])
-def test_analytic_shapes_that_cut_others_are_warned_about(kind, height):
-    """Those that only touch are not."""
+def test_analytic_shapes_that_cut_hair_are_warned_about(kind, height, tmp_path):
+    """Those that only touch are not, nor those that cut meshes."""
     T = mi.ScalarTransform4f
     turn = T().rotate([1, 0, 0], 90) if kind == "disk" else T().rotate([1, 0, 0], -90) if kind == "cylinder" else T()
     lowest = {"sphere": 0.5, "cylinder": 0.0, "disk": 0.5}[kind]
     place = T().translate([0.1, lowest + height, 0.2]) @ (turn if kind != "disk" else T()) @ T().scale(0.5)
     thing = {"type": kind, "to_world": place, "bsdf": cases.diffuse(0.5, two_sided=True)}
     floor = cases.horizontal((0, 0, 0), 2, "floor", bsdf=cases.diffuse(0.5, two_sided=True))
-    found = said(cases.scene(sensor=cases.camera(), thing=thing, floor=floor, sky=cases.constant()), "thing.to_world")
-    assert any("cut through other shapes" in message and '"floor"' in message for message in found) == (height < 0)
+    strands = tmp_path / "strands"  # thick ones, on the floor
+    strands.write_text("\n\n".join(f"-2 -0.3 {z} 0.3\n2 -0.3 {z} 0.3" for z in np.linspace(-0.4, 0.6, 11)))
+    hair = {"type": "linearcurve", "filename": str(strands), "bsdf": cases.diffuse(0.5)}
+    for others, warned in (({}, False), ({"hair": hair}, height < 0)):
+        shapes = {"thing": thing, "floor": floor, **others}
+        found = said(cases.scene(sensor=cases.camera(), **shapes, sky=cases.constant()), "thing.to_world")
+        assert any("cut through shapes" in message and '"hair"' in message for message in found) == warned
 
 
 SKIES = {
