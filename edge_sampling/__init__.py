@@ -1,5 +1,6 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
+from .boundaries.deep_shadows import DeepShadows
 from .boundaries.face_planes import FacePlanes
 from .boundaries.film_boundary import BoundarySamples, FilmBoundary
 from .boundaries.horizon import Horizon, Horizons
@@ -26,6 +27,7 @@ __all__ = [
     "Batch",
     "BoundarySamples",
     "Cone",
+    "DeepShadows",
     "EdgeKind",
     "EdgeSample",
     "EdgeTree",
