@@ -78,7 +78,7 @@ class ShadowBoundary:
     """
 
     DRJIT_STRUCT = dict.fromkeys(
-        ("silhouettes", "lights", "smooth_lamps", "chosen", "any_surface", "any_other", "spots")
+        ("silhouettes", "lights", "smooth_lamps", "chosen", "any_surface", "any_other")
     )  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
