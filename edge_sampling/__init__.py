@@ -1,5 +1,6 @@
 """Sampling the edges at which an image jumps: the mechanism behind Rimlight's plugins. Registers nothing."""
 
+from .boundaries.deep_shadows import DeepShadows
 from .boundaries.face_planes import FacePlanes
 from .boundaries.film_boundary import BoundarySamples, FilmBoundary
 from .boundaries.horizon import Horizon, Horizons
@@ -28,6 +29,7 @@ __all__ = [
     "BoundarySamples",
     "Cone",
     "CutCurves",
+    "DeepShadows",
     "EdgeKind",
     "EdgeSample",
     "EdgeTree",

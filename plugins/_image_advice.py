@@ -1,8 +1,9 @@
-"""Which integrator suits images of a scene: is its light found from the camera, or from the lights?"""
+"""Which integrator suits a scene: is its light found from the camera, or from the lights; and is it reflected once, or
+several times?"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -19,32 +20,48 @@ PAYS = 0.02
 #: Blocks along the film, and samples in each.
 BLOCKS, SAMPLES = 32, 64
 
+#: Up to this part of all light may be reflected more than once without a need for more than direct illumination.
+FEW = 0.005
+
 
 @dataclass(frozen=True)
 class ImageAdvice:
-    """Which integrator suits images of a scene. `print` it.
+    """Which integrator suits images of a scene, and its derivatives. `print` it.
 
-    integrator : plugin.
+    integrator : plugin for images.
     share : of the light that the sensor sees, how much is found from the lights.
+    indirect : how much is reflected more than once.
     """
 
     integrator: str
     share: float
+    indirect: float
+
+    @property
+    def derivative(self) -> str:
+        """Plugin for derivatives."""
+        if self.integrator == "bdpt":
+            return "bdpt_edge"
+        return "direct_edge" if self.indirect <= FEW else "prb_edge"
 
     def __str__(self) -> str:
         if self.integrator == "bdpt":
+            found = f"{100 * self.share:.0f} % of the light that the sensor sees is found from the lights"
             return (
-                f"images: bdpt, since {100 * self.share:.0f} % of the light that the sensor sees is found from the "
-                "lights, and hardly from the camera"
+                f"images: bdpt, since {found}, and hardly from the camera\nderivatives: bdpt_edge, for the same reason"
             )
-        return "images: path or prb_edge, since light samples from the camera find what bdpt would find, in less time"
+        images = "images: path or prb_edge, since light samples from the camera find what bdpt would find, in less time"
+        part = f"{100 * self.indirect:.1f} % of the light that the sensor sees is reflected more than once"
+        return f"{images}\nderivatives: {self.derivative}, since {part}"
 
 
 def image_advice(scene: mi.Scene, *, sensor: int = 0, max_depth: int = 6) -> ImageAdvice:
-    """Which integrator suits images of a scene: `bdpt`, or `path` and those that render the same.
+    """Which integrator suits images of a scene: `bdpt`, or `path` and those that render the same; and which suits their
+    derivatives: `bdpt_edge`, `prb_edge` or `direct_edge`.
 
-    It renders a small image by `bdpt`, and looks at which part of it those ways make that start at the camera: a few
-    seconds, most of them compilation.
+    It renders a small image by `bdpt`, and looks at which part of it those ways make that start at the camera, and
+    which part is reflected more than once: a few seconds, most of them compilation. It looks at the image alone. What
+    changes is not known to it, so a derivative may have other noise: `balance` measures that of one motion.
 
     max_depth : of the paths, in segments; -1 stands for no limit.
 
@@ -72,5 +89,7 @@ def image_advice(scene: mi.Scene, *, sensor: int = 0, max_depth: int = 6) -> Ima
     total = light((None, None))
     from_camera = light((0, None)) + light((1, None))
     found = total - from_camera > MOSTLY * total
-    share = float(total[found].sum() / total.sum()) if total.any() else 0.0
-    return ImageAdvice("bdpt" if share > PAYS else "path", share)
+    part = lambda light: float(light.sum() / total.sum()) if total.any() else 0.0
+    share = part(total[found])
+    it.depths = replace(it.depths, max_depth=min(2, it.depths.max_depth))
+    return ImageAdvice("bdpt" if share > PAYS else "path", share, max(1 - part(light((None, None))), 0.0))

@@ -17,8 +17,11 @@ def hidden(name: str) -> mi.Scene:
 
 WALL = {"key": "right.bsdf.reflectance.value", "direction": [1]}
 
+DOOR = {"key": "door.vertex_positions", "rotate": [0, 1, 0], "pivot": [-0.7, 0, 2.05]}
+
 #: Of each case: scene, motion, step.
 HIDDEN = {
     "lampshade_wall": (partial(hidden, "lampshade"), WALL, 5e-2),
+    "door": (partial(hidden, "door_ajar"), DOOR, 1e-2),
     "caustic_lamp": (partial(hidden, "glossy_caustic"), {"key": "lamp.to_world", "direction": [1, 0, 0]}, 1e-2),
 }

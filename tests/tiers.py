@@ -82,12 +82,15 @@ test_bdpt_edge.py::test_any_number_of_light_paths[0.1
 test_bdpt_edge.py::test_any_number_of_light_paths[2.0
 test_bdpt_edge.py::test_both_modes[caustic_lamp
 test_bdpt_edge.py::test_both_modes[cornell_box_camera
+test_bdpt_edge.py::test_both_modes[door
 test_bdpt_edge.py::test_both_modes[veil_and_mirror
 test_bdpt_edge.py::test_frozen[<lambda>
 test_bdpt_edge.py::test_interior_is_that_of_path_replay[ball_on_floor
 test_bdpt_edge.py::test_interior_is_that_of_path_replay[mirrored_sphere
 test_bdpt_edge.py::test_interior_is_that_of_path_replay[rough_panes
 test_bdpt_edge.py::test_interior_is_that_of_path_replay[spot_behind_screen
+test_bdpt_edge.py::test_shadows_continued_from_the_light
+test_bdpt_edge.py::test_shadows_in_light_from_surfaces
 test_blinn_phong.py::test_shadows_and_reflections_move
 test_blinn_phong.py::test_textures_in_a_render[diffuse_reflectance-direct_edge]
 test_blinn_phong.py::test_textures_in_a_render[roughness-prb_edge]

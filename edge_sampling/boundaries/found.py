@@ -9,6 +9,7 @@ from rimlight.edge_sampling.choice.silhouettes import Silhouettes
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_lines import TextureLines
 
+from .deep_shadows import DeepShadows
 from .face_planes import FacePlanes
 from .film_boundary import FilmBoundary
 from .fine_mirrors import FineMirrors
@@ -24,7 +25,8 @@ class Boundaries:
     `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` :
     those whose fringe is not looked at closely. `textures` : where those jump that the camera may see move, and mapped
     normals turn away. `surfaces` : what chains meet, where there are mirrors or textures. `lights` : chooses one, where
-    there are many. `indirect` : shadows, and borders of beams, in indirect light."""
+    there are many. `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from
+    surfaces."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -41,6 +43,7 @@ class Boundaries:
     textures: TextureLines | None = None
     surfaces: Surfaces | None = None
     lights: LightChoice | None = None
+    deep: DeepShadows | None = None
 
     @property
     def silhouettes(self) -> Silhouettes | None:

@@ -30,8 +30,10 @@ class IndirectBeams(IndirectShadows):
 
     DRJIT_STRUCT = IndirectShadows.DRJIT_STRUCT | {"lines": None}  # for `dr.freeze`
 
-    def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
-        super().__init__(scene, silhouettes)
+    def __init__(
+        self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None = None, *, hidden: bool = False
+    ):
+        super().__init__(scene, silhouettes, moving, hidden=hidden)
         self.lines = BeamLines(scene, self.lights)
 
     def counts(self, emitter: mi.Emitter) -> bool:
@@ -54,6 +56,9 @@ class IndirectBeams(IndirectShadows):
         active = (e.density > 0) & dr.isfinite(dr.squared_norm(lit))
         # The light may lie on a surface, which throws no shadow on what it faces.
         return LitEdge(e, light.y + ω * rounding(light.y, light.y), along, lit, d, ω, active)
+
+    def _moves(self, edge: LitEdge, shadow: Shadow) -> mi.Float:
+        return mi.Float(1)
 
     def _on_picture(self, e: EdgeSample) -> tuple[mi.Point2f, mi.Vector2f, mi.Vector2f]:
         """Place, tangent, and unit normal of a point of a line, in the picture of the light."""
@@ -93,8 +98,9 @@ class IndirectBeams(IndirectShadows):
         return dr.select(active, jump, 0)
 
     def _unshadowed(
-        self, scene: mi.Scene, z: mi.SurfaceInteraction3f, light: LightPoint, edge: LitEdge, shadow: Shadow, active
+        self, scene: mi.Scene, z: mi.SurfaceInteraction3f | None, light: LightPoint, edge, shadow: Shadow, active
     ) -> mi.Float:
         active = active & shadow.active
-        arrives = dr.max(dr.abs(self._difference(scene, light, edge, shadow, z.wavelengths, active)))
+        wavelengths = shadow.ray.wavelengths if z is None else z.wavelengths
+        arrives = dr.max(dr.abs(self._difference(scene, light, edge, shadow, wavelengths, active)))
         return self._reflected(z, light, edge, shadow, arrives * dr.abs_dot(shadow.facing, edge.ω), active)

@@ -226,8 +226,7 @@ class ShadingBoundary:
     ) -> mi.Spectrum:
         """What a point on an edge does to the light that is reflected.
 
-        light : the only one whose emission counts.
-        emission : does emitted light count, or scattered light?
+        light : the only one whose emission counts. emission : does emitted light count, or scattered light?
         vicinity : within which the directions are held, in which scattered light arrives.
         """
         scene, si = tracer.scene, point.si
@@ -252,11 +251,11 @@ class ShadingBoundary:
             n_dl = dr.select(active, n_dl, 0)
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
-            def look(side, active, slack=1):
-                return _look(scene, si, x, p, side * aside * across, slack * aside, distance, active)
+            def see(side, active, slack=1):
+                return look(scene, si, x, p, side * aside * across, slack * aside, distance, active)
 
             side = dr.select(outward != 0, outward, 1)
-            ray, pi, y, hidden, own = look(side, active)
+            ray, pi, y, hidden, own = see(side, active)
             past = outward != 0
             active &= ~hidden & (past | own)
             L = self._emitted(scene, point, y, ω, pdf, distance, active & past & emission, light, ~outline.is_line)
@@ -270,11 +269,12 @@ class ShadingBoundary:
                     beside = ~past
                     soft = beside & self.silhouettes.only_bends(sample) & spreads(y.bsdf()) & self.soft
                     lune = Lune.between(outline.tangent, outline.normals, soft)
-                scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune)
+                found = _found_from_points(point, p, y, ω, past & ~outline.is_line)
+                scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune, found)
                 L += dr.select(reflected, scattered, 0)
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
                 of_faces = active & ~emission & (near > 0) & ~outline.is_line
-                other_ray, other_pi, _, hidden, own = look(-side, of_faces, slack=2)
+                other_ray, other_pi, _, hidden, own = see(-side, of_faces, slack=2)
                 reflected = of_faces & ~hidden & own
                 beside = reflected if self.smooth else None
                 other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected, beside, lune)
@@ -287,9 +287,9 @@ class ShadingBoundary:
         with dr.resume_grad():
             p = self.silhouettes.point(placement, sample, dr.detach(x)).p
             x = si.p + lift
-            edge = _turning(n_dl, p - x, active)
+            edge = turning(n_dl, p - x, active)
             d = material_point(ray, pi, valid).p - x
-            beyond = vicinity.far(dr.detach(dr.squared_norm(d))) * _turning(n_dl, d, valid)
+            beyond = vicinity.far(dr.detach(dr.squared_norm(d))) * turning(n_dl, d, valid)
             value = -side * L * (edge - beyond)
             return value + faces * edge if tracer.scatters(2) else value
 
@@ -333,6 +333,34 @@ class ShadingBoundary:
         return L
 
 
+def density_from_points(
+    density: mi.Float, cos_z: mi.Float, cos_x: mi.Float, cos_y: mi.Float, r_x: mi.Float, r_y: mi.Float
+) -> mi.Float:
+    """Density with which y is found from points x, relative to that with which it is found as a vertex of a light
+    subpath: by area; but each way is left less of the edges that are close to where it starts, of which both choose too
+    few.
+
+    What slides over a surface that is seen edge-on moves as 1 / `cos_z`: more of it is found from points than the
+    densities alone would have it.
+
+    density : by area, with which x is found from the vertex before. cos_z : of the angle between the normal at x and
+    the direction to that. cos_x, cos_y : between the line past the edge and the normals. r_x, r_y : distances of the
+    edge.
+    """
+    return density / dr.square(cos_z) * cos_x / cos_y * dr.square(r_x / r_y)
+
+
+def _found_from_points(
+    point: ShadingPoint, p: mi.Point3f, y: mi.SurfaceInteraction3f, ω: mi.Vector3f, active: mi.Bool
+) -> mi.Float:
+    """`density_from_points` of what is seen past the point p of an edge; infinite where `DeepShadows` does not find
+    it."""
+    si, (r_x, r_y) = point.si, (dr.norm(p - q) for q in (point.si.p, y.p))
+    cos_z, cos_x, cos_y = dr.abs_dot(si.n, si.to_world(si.wi)), dr.abs_dot(si.n, ω), dr.abs_dot(y.n, y.to_world(y.wi))
+    found = density_from_points(point.density, cos_z, cos_x, cos_y, r_x, r_y)
+    return dr.select(active & (point.depth > 1), found, dr.inf)
+
+
 def _chosen(
     candidate: Callable, choice: mi.Float, emission: mi.Bool, scattering: mi.Bool, sampler: mi.Sampler
 ) -> tuple[EdgeSample, mi.Bool]:
@@ -367,7 +395,7 @@ def _chosen(
     return e, for_emission
 
 
-def _look(scene, si, x, p, beside, aside, distance, active):
+def look(scene, si, x, p, beside, aside, distance, active):
     """What is seen from x at the point p of an edge and a little beside it: ray, intersections; whether something
     before the edge hides it; and whether it is a surface on which the edge lies.
 
@@ -381,7 +409,7 @@ def _look(scene, si, x, p, beside, aside, distance, active):
     return ray, pi, y, pi.is_valid() & (pi.t < distance) & off, pi.is_valid() & ~off
 
 
-def _turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:
+def turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:
     """Zero, with the gradient of the direction of d, along `n_dl`."""
     ω = dr.normalize(dr.select(valid, d, mi.Vector3f(0, 0, 1)))
     return dr.select(valid, dr.dot(n_dl, ω - dr.detach(ω)), 0)

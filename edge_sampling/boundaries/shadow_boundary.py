@@ -21,9 +21,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.choice.emitter_boxes import SLACK
 from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
-from rimlight.edge_sampling.choice.views import View
+from rimlight.edge_sampling.choice.views import Cone, View
 from rimlight.edge_sampling.geometry.device_edges import beside_edge, rounding
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.parametrisation import material_point
@@ -33,6 +34,9 @@ from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .tracer import Tracer
 
+#: Of spots that are wider, degrees, edges are sought in all directions.
+WIDEST = 85.0
+
 
 def throws_shadows(emitter: mi.Emitter) -> bool:
     """Are the shadows that edges throw in the light of this emitter found from the emitter? Not so those of
@@ -41,6 +45,11 @@ def throws_shadows(emitter: mi.Emitter) -> bool:
     if flags & mi.EmitterFlags.Surface:
         return not flags & mi.EmitterFlags.Delta
     return bool(flags & mi.EmitterFlags.Delta) or hasattr(emitter, "light_count")
+
+
+def is_spot(emitter: mi.Emitter) -> bool:
+    """Does an emitter shine into a cone of less than a half-space?"""
+    return emitter.class_name() == "SpotLight" and bool(dr.all(mi.traverse(emitter)["cutoff_angle"] < WIDEST))
 
 
 @dataclass
@@ -80,6 +89,10 @@ class ShadowBoundary:
         self.chosen = mi.UInt32([k for k, i in enumerate(self.lights.emitter) if self.counts(emitters[i])])
         on_surface = {bool(e.flags() & mi.EmitterFlags.Surface) for e in emitters if self.counts(e)}
         self.any_surface, self.any_other = True in on_surface, False in on_surface
+        #: Spots, and their numbers in `Lights`: edges outside of their beams throw no shadow in their light.
+        self.spots = [(k, emitters[i]) for k, i in enumerate(self.lights.emitter) if is_spot(emitters[i])]
+        far = any(e.flags() & mi.EmitterFlags.Infinite for e in emitters if self.counts(e))
+        self.spots = [] if far else self.spots
 
     def counts(self, emitter: mi.Emitter) -> bool:
         """Are the shadows in its light sampled?"""
@@ -195,12 +208,24 @@ class ShadowBoundary:
         silhouettes, far, y = self.silhouettes, light.far, light.y
         eye = dr.select(far, mi.Vector3f(y), mi.Vector3f(y - silhouettes.centre))
         one = dr.full(mi.Float, 1, dr.width(light.choice))
-        view = View(eye, light.n, one, [], far=far if self.any_other else None)
+        view = View(eye, light.n, one, [], self._beam(light), far if self.any_other else None)
         active = (light.density > 0) & dr.isfinite(light.density)
         # Shadows of edges that stand still matter only on what moves.
         use = [1, 0.2][: silhouettes.groups]
         e = silhouettes.sample(placement, view, sampler, use, choice=light.choice, from_light=True, active=active)
         return self._edge_at(placement, light, e)
+
+    def _beam(self, light: LightPoint) -> Cone | None:
+        """The directions in which lights shine; None: all."""
+        if not self.spots:
+            return None
+        cone = Cone(mi.Vector3f(0, 0, 1), mi.Float(-1), mi.Float(0))
+        for number, emitter in self.spots:
+            params = mi.traverse(emitter)
+            sin, cos = dr.sincos(dr.detach(dr.deg2rad(params["cutoff_angle"])) * (1 + SLACK))
+            axis = dr.normalize(dr.detach(params["to_world"]) @ mi.Vector3f(0, 0, 1))
+            cone = dr.select(light.light == number, Cone(axis, cos, sin), cone)
+        return cone
 
     def _edge_at(self, placement: Placement, light: LightPoint, e: EdgeSample) -> LitEdge:
         """The point of an edge that was sampled, as the light sees it."""

@@ -77,9 +77,39 @@ class Tracer(Protocol):
         active: mi.Bool,
         beside_outline: mi.Bool | None = None,
         lune: Lune | None = None,
+        found: mi.Float | None = None,
     ) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`.
 
         beside_outline : is it met just inside of its outline? Then interpolated normals that face away are turned.
         lune : where it is active, only light from there need be scattered.
+        found : density with which this is found so, over that with which it is by `DeepShadows`: infinite, never.
         """
+
+
+@dataclass
+class Sender:
+    """A vertex of a light subpath, which sends light on. (A Dr.Jit structure: not frozen.)
+
+    si : the surface there. power : arrives there, see `LightVertex.β`. one, more : see `Shorter`.
+    facing : mi.Vector3f, normal on the side to which it sends light; 0: to both, `through`.
+    """
+
+    si: mi.SurfaceInteraction3f
+    power: mi.Spectrum
+    one: mi.Float
+    more: mi.Float
+    facing: mi.Vector3f
+    through: mi.Bool
+    active: mi.Bool
+
+
+class LightTracer(Tracer, Protocol):
+    """Traces paths from lights, too. All that is returned is detached."""
+
+    def sender(self, count: int, depth: mi.UInt32, active: mi.Bool) -> Sender:
+        """One for each of `count` points of this number along their paths, which are to be lit by it."""
+
+    def sent(self, sender: Sender, d: mi.Vector3f, found: mi.Float, active: mi.Bool) -> mi.Spectrum:
+        """What it sends in a direction, by area across it, weighted. d : unit vector, world space. found : see
+        `Tracer.scattered`."""

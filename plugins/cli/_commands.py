@@ -58,11 +58,11 @@ class PlanCommand(OnSensor):
     param: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KEY")] = ()
     """Parameter that changes, as `rimlight params` lists it. May be repeated. Default: the camera and all vertices."""
     integrator: str = "prb_edge"
-    """Integrator that renders: direct_edge or prb_edge."""
+    """Integrator that renders: direct_edge, prb_edge or bdpt_edge."""
     spp: int = 16
     """Samples per pixel."""
     images: bool = False
-    """Say also which integrator suits images of the scene: bdpt or path. Takes some seconds."""
+    """Say also which integrator suits images of the scene, and which its derivatives. Takes some seconds."""
 
     def run(self) -> int:
         at_least(1, spp=self.spp)

@@ -12,6 +12,7 @@ from rimlight._collection import collect_before
 from rimlight._plan import names
 from rimlight.edge_sampling import (
     CutCurves,
+    DeepShadows,
     Edges,
     FacePlanes,
     FilmBoundary,
@@ -56,13 +57,15 @@ class BoundarySearch:
     depths : of its paths.
     planes : does its derivative have what the planes of faces do to soft light, where other normals shade?
     from_points : does it have boundaries as shading points see them?
+    from_surfaces : and as vertices of light subpaths see them?
     """
 
     #: Nothing, for `dr.freeze`: what a frozen function depends on is what `find_boundaries` returns to it.
     DRJIT_STRUCT = dict.fromkeys(())
 
-    def __init__(self, who: str, depths: Depths, *, planes: bool, from_points: bool):
-        self.who, self.depths, self.planes, self.from_points = who, depths, planes, from_points
+    def __init__(self, who: str, depths: Depths, *, planes: bool, from_points: bool, from_surfaces: bool):
+        self.who, self.depths, self.planes = who, depths, planes
+        self.from_points, self.from_surfaces = from_points, from_surfaces
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
         self._instances = Instances()
@@ -206,6 +209,9 @@ class BoundarySearch:
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect = self._in_reflected_light(scene, moving, sppi)
         abilities = {"planes": self.planes, "from_points": self.from_points}
+        deep = None
+        if shading is not None and self.from_surfaces and self.depths.scatters(3):
+            deep = DeepShadows(scene, shading.silhouettes)
         limits = lasting_limits(scene, self.geometry, self.edges, self.depths, moving, sppi, **abilities)
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
@@ -215,7 +221,7 @@ class BoundarySearch:
         textures = self._texture_lines(scene, moving, mirrors[0]) if self.from_points else None
         chains = (*mirrors, textures, Surfaces(scene) if mirrors[0] or textures else None)
         lights = LightChoice.of(scene)
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights)
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights, deep)
 
     @staticmethod
     def _texture_lines(scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
@@ -237,10 +243,12 @@ class BoundarySearch:
             return None, None, ()
         shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, ()
         if self.from_points:
-            shading = ShadingBoundary(scene, silhouettes, None if everything else list(moving.shapes))
+            shapes = None if everything else list(moving.shapes)
+            shading = ShadingBoundary(scene, silhouettes, shapes)
             shading = shading if self.depths.scatters(2) or shading.emission_at_first else None
             kinds = (IndirectShadows, IndirectBeams) if self.depths.scatters(2) else ()
-            indirect = tuple(found for kind in kinds if len(found := kind(scene, silhouettes)))
+            found = [kind(scene, silhouettes, shapes, hidden=self.from_surfaces) for kind in kinds]
+            indirect = tuple(f for f in found if len(f))
         return shadows if len(shadows) else None, shading, indirect
 
     def _face_planes(self, scene: mi.Scene, moving: Moving) -> FacePlanes | None:

@@ -7,6 +7,8 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.terms.bidirectional import BidirectionalTerm
+from rimlight.terms.deep import DeepShadowsTerm
+from rimlight.terms.indirect import ContinuedShadowsTerm
 from rimlight.terms.order import TERMS
 from rimlight.terms.sampling import in_a_row, seed_of
 from rimlight.terms.term import Job
@@ -50,15 +52,15 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
        - Hide directly visible emitters. (Default: no)
 
     Renders what ``bdpt`` renders, and differentiates it with respect to what ``prb_edge`` differentiates. Use it where
-    light is hard to find from the camera, such as caustics and the light of lamps in shades or behind doors, and where
-    what changes are materials and lamps. If what hides the light moves, most of the noise is at boundaries, which it
-    shares with ``prb_edge``. In the open, ``prb_edge`` takes about half of its time for the same noise.
+    light is hard to find from the camera, such as caustics and the light of lamps in shades or behind doors. In the
+    open, ``prb_edge`` takes about half of its time for the same noise; ``rimlight plan --images`` says which suits.
 
     **Interior.** Each camera path and each light path keeps one of the paths that were made of it, in proportion to its
     light, and differentiates this path alone, from its light to the camera. Vertices are held as in ``prb_edge``,
     however they were found: see the documentation under "Theory". In memory are 28 to 40 bytes for each vertex.
 
-    **Boundaries** are those of ``prb_edge``. What is seen on both sides of them is connected with light paths.
+    **Boundaries** are those of ``prb_edge``. What is seen on both sides of them is connected with light paths. Shadows
+    in indirect light go on from where they fall, too, and edges are looked for from surfaces that light paths meet.
 
     **Limits.** Those of ``prb_edge``. The derivative knows only paths that bring light: with respect to a reflectance
     or a radiance that is 0, it is 0, with a warning. Missing, with a warning, are the caustics that perfect mirrors and
@@ -79,8 +81,9 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
     """
 
     OPTIONS = (*prb_edge.PRBEdgeIntegrator.OPTIONS, "light_paths")
+    FROM_SURFACES = True
     TRACER = BidirectionalTracer
-    TERMS = (BidirectionalTerm(), *TERMS[1:])
+    TERMS = (BidirectionalTerm(), *TERMS[1:], DeepShadowsTerm(), ContinuedShadowsTerm())
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)

@@ -57,6 +57,9 @@ class EdgeIntegrator(ADIntegrator):
     #: Does it have boundaries as shading points see them?
     FROM_POINTS = True
 
+    #: And as vertices of light subpaths see them?
+    FROM_SURFACES = False
+
     #: Can samples be divided among its terms, see `balance`?
     BALANCES = True
 
@@ -77,7 +80,8 @@ class EdgeIntegrator(ADIntegrator):
         if mi.is_polarized:
             raise InputError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
-        self.search = BoundarySearch(self.name, self.depths, planes=self.PLANES, from_points=self.FROM_POINTS)
+        options = {"planes": self.PLANES, "from_points": self.FROM_POINTS, "from_surfaces": self.FROM_SURFACES}
+        self.search = BoundarySearch(self.name, self.depths, **options)
         #: By what the samples of a term are multiplied, by its name; empty: all have as many. See `balance`.
         self.shares: dict[str, float] = {}
         self._warned: set[str] = set()

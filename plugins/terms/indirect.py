@@ -28,15 +28,34 @@ class IndirectShadowsTerm(FromPoints):
     def boundary(self, job: Job) -> tuple[IndirectShadows, ...]:
         return job.boundaries.indirect
 
+    #: How many more vertices there are than that of the path.
+    reach = 1
+
+    def sample(self, boundary: IndirectShadows, *arguments) -> mi.Spectrum:
+        """See `IndirectShadows.at`."""
+        return boundary.at(*arguments)
+
     def reflected(
         self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
     ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
         boundaries = self.boundary(job)
-        placement, point, cuts = placement_and_point(job, boundaries[0].silhouettes, ray, sampler, beyond=1)
+        placement, point, cuts = placement_and_point(job, boundaries[0].silhouettes, ray, sampler, beyond=self.reach)
         L = mi.Spectrum(0)
         for boundary in boundaries:
-            of_one = boundary.at(job.tracer, placement, point, sampler, choice)
+            of_one = self.sample(boundary, job.tracer, placement, point, sampler, choice)
             with dr.resume_grad():
                 L += of_one
         with dr.resume_grad():
             return L * point.β, cuts
+
+
+class ContinuedShadowsTerm(IndirectShadowsTerm):
+    """The same by way of one more vertex, which is found from the shadow."""
+
+    name, reach = "shadows in indirect light, continued", 2
+
+    def boundary(self, job: Job) -> tuple[IndirectShadows, ...]:
+        return job.boundaries.indirect if job.tracer.scatters(3) else ()
+
+    def sample(self, boundary: IndirectShadows, *arguments) -> mi.Spectrum:
+        return boundary.onwards(*arguments)

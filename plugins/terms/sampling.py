@@ -13,6 +13,7 @@ from rimlight.edge_sampling.refusals import Refusal
 SALT = {"film boundary": 0xFFFFFFFF, "shadows from lights": 0xAAAAAAAA, "edges from points": 0x55555555}
 SALT |= {"planes of faces": 0x33333333, "shadows in indirect light": 0x99999999}
 SALT |= {"mirrors and textures": 0x66666666}
+SALT |= {"shadows in light from surfaces": 0x88888888, "shadows in indirect light, continued": 0x77777777}
 SALT |= {"light paths": 0xCCCCCCCC, "passes": 0x0}
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.

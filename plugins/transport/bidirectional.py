@@ -129,7 +129,7 @@ class CameraPaths:
         reachable = active & (number > 1)
         pdf, arrival = self.emission.met(at, ds, reachable)
         w = weight(pdf * shorter.one, arrival * shorter.more)
-        return emitter.eval(si, active) * dr.select(number > 1, w, 1)
+        return emitter.eval(si, active) * dr.select(reachable, w, 1)
 
     def _from_lights(self, si, bsdf, shorter: Shorter, number, sampler, active) -> tuple[mi.Spectrum, LightEnd]:
         """What the vertex reflects of a light sample, weighted, and where on the light that is."""

@@ -10,16 +10,21 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
+from rimlight.edge_sampling.boundaries.tracer import Sender
 
 from .bidirectional import CameraPaths
 from .emission import Around, Emission
 from .film_views import FilmViews
 from .found_light import LightEnd, OnePath, Seen, Total, Way
-from .light_subpaths import LightSubpaths, LightVertex, Ways
+from .light_subpaths import LightSubpaths, LightVertex, Ways, light_towards
 from .paths import Vertex
+from .subpath_weights import Shorter, weight
 from .tracer import PathTracer, Radiance, camera_vertex
 from .vertex_table import VertexTable
 from .whole_paths import Part, WholePaths
+
+#: Sine of the angle between interpolated normal and face from which a surface is taken to send light to both sides.
+BENT = 1e-4
 
 
 class KeepOne:
@@ -101,7 +106,7 @@ class BidirectionalTracer(PathTracer):
             L, valid = dr.select(by_lune, other.L, L), valid | (by_lune & other.valid)
         return Radiance(L, valid)
 
-    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None, lune=None) -> mi.Spectrum:
+    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None, lune=None, found=None) -> mi.Spectrum:
         by_lune = active & lune.active if lune is not None else None
         others = active & ~by_lune if by_lune is not None else active
 
@@ -113,7 +118,13 @@ class BidirectionalTracer(PathTracer):
 
         vertex = camera_vertex(ray, pi)
         vertex.depth = depth + 1
-        L, _ = self._connected(vertex, sampler.clone(), others & pi.is_valid(), turn, shines=False)
+        shorter = None
+        if found is not None:
+            # In another way, it is found as a vertex of a light subpath: `DeepShadows`.
+            y = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, others)
+            one = dr.abs_dot(y.n, ray.d) / (found * dr.square(pi.t))
+            shorter = Shorter(dr.select((found > 0) & dr.isfinite(one), one, 0), dr.zeros(mi.Float, dr.width(one)))
+        L, _ = self._connected(vertex, sampler.clone(), others & pi.is_valid(), turn, shines=False, shorter=shorter)
         if by_lune is not None:
             other = super().scattered(ray, pi, depth, sampler, by_lune, beside_outline, lune)
             L = dr.select(by_lune, other, L)
@@ -129,12 +140,32 @@ class BidirectionalTracer(PathTracer):
 
         return self._connected(vertex, sampler, active, turn, shines=True)
 
-    def _connected(self, vertex: Vertex, sampler, active, turn, *, shines: bool) -> tuple[mi.Spectrum, mi.Bool]:
+    # ---------------------- Shadows in light from surfaces ----------------------
+
+    def sender(self, count: int, depth: mi.UInt32, active: mi.Bool) -> Sender:
+        light = self._lights[2]
+        vertex = dr.gather(LightVertex, light, dr.arange(mi.UInt32, count) % dr.width(light.number), active)
+        active &= (vertex.number > 0) & self.depths.scatters(depth + vertex.number)
+        si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
+        through = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
+        # Behind its plane, interpolated normals may send light, too.
+        through |= dr.norm(dr.cross(si.n, si.sh_frame.n)) > BENT
+        facing = dr.select(through, 0, dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, vertex.d)))
+        return Sender(si, vertex.β, vertex.one, vertex.more, facing, through, active)
+
+    def sent(self, sender: Sender, d: mi.Vector3f, found: mi.Float, active: mi.Bool) -> mi.Spectrum:
+        shorter = Shorter(sender.one, sender.more)
+        there = light_towards(sender.si, sender.si.bsdf(), shorter, d, active)
+        return there.f * sender.power * weight(found * there.shorter)
+
+    def _connected(
+        self, vertex: Vertex, sampler, active, turn, *, shines: bool, shorter: Shorter | None = None
+    ) -> tuple[mi.Spectrum, mi.Bool]:
         """Light that arrives by way of a vertex, with connections, without its β; see `CameraPaths.trace`."""
         emission, ways, light = self._lights
         camera = CameraPaths(self.scene, emission, self.depths, ways, hide_emitters=self.hide_emitters)
         total = Total(dr.zeros(mi.Spectrum, dr.width(vertex.depth)))
-        got, stopped = camera.trace(vertex, None, sampler, light, total, active, turn=turn, shines=shines)
+        got, stopped = camera.trace(vertex, shorter, sampler, light, total, active, turn=turn, shines=shines)
         return got.L, stopped
 
     @cached_property

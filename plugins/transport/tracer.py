@@ -167,12 +167,12 @@ class PathTracer:
         c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass)
         return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.since < c.depth, c.vicinity, c.density), c
 
-    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None, lune=None) -> mi.Spectrum:
+    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None, lune=None, found=None) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`. Detached.
 
         ray, pi : the ray and what it meets. sampler : for the paths beyond. active : mi.Bool, (N,)
         beside_outline : mi.Bool, (N,), is it met just inside of its outline?
-        lune : see `Scattering.scatter`, for what the ray meets.
+        lune : see `Scattering.scatter`, for what the ray meets. found : of no use here, see `Tracer`.
         """
         one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)

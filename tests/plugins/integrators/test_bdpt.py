@@ -434,13 +434,21 @@ def test_shipped_scenes(variant, name):
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"), [("glossy_caustic", "bdpt"), ("door_ajar", "bdpt"), ("lit_room", "path")]
+    ("name", "expected", "derivative"),
+    [
+        ("glossy_caustic", "bdpt", "bdpt_edge"),
+        ("door_ajar", "bdpt", "bdpt_edge"),
+        ("lampshade", "bdpt", "bdpt_edge"),
+        ("lit_room", "path", "prb_edge"),
+        ("cube", "path", "direct_edge"),
+        ("shadow_blocker", "path", "direct_edge"),
+    ],
 )
-def test_advice(variant, name, expected):
+def test_advice(variant, name, expected, derivative):
     scene = mi.load_file(str(scenes.path(name)), res=32)
-    advice = image_advice(scene, max_depth=scene.integrator().depths.max_depth)
-    assert advice.integrator == expected
-    assert str(advice).startswith(f"images: {expected}")
+    advice = image_advice(scene, max_depth=8)
+    assert advice.integrator == expected and advice.derivative == derivative
+    assert str(advice).startswith(f"images: {expected}") and f"derivatives: {derivative}" in str(advice)
     assert (advice.share > 0.05) == (expected == "bdpt")
 
 
@@ -455,4 +463,4 @@ def test_plan_gives_advice(variant, capsys):
     assert main([*arguments, "--images"]) == 0
     with_advice = capsys.readouterr().out
     assert main(arguments) == 0
-    assert with_advice == capsys.readouterr().out + f"{ImageAdvice('path', 0.0)}\n"
+    assert with_advice == capsys.readouterr().out + f"{ImageAdvice('path', 0.0, 0.0)}\n"

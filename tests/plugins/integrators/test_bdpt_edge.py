@@ -14,6 +14,7 @@ import rooms
 from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, derivative_image
+from rimlight.edge_sampling.boundaries import deep_shadows, shading_boundary
 from rimlight.transport.vertex_table import VertexTable
 
 RUNS = 6
@@ -67,7 +68,7 @@ def test_any_number_of_light_paths(light_paths):
     assert_equal(few, derivatives(case, "prb_edge", 100, 64))
 
 
-@pytest.mark.parametrize("name", ["cornell_box_camera", "glass_index", "veil_and_mirror", "caustic_lamp"])
+@pytest.mark.parametrize("name", ["cornell_box_camera", "glass_index", "veil_and_mirror", "caustic_lamp", "door"])
 def test_both_modes(name):
     """⟨w, J v⟩ = ⟨Jᵀ w, v⟩ with all terms."""
     case = cases.case(name)
@@ -82,6 +83,47 @@ def test_both_modes(name):
     dr.enqueue(dr.ADMode.Backward, motion.params[motion.key])
     dr.traverse(dr.ADMode.Backward)
     assert dr.grad(theta)[0] == pytest.approx((w * forward).sum(), abs=1e-4 * np.abs(w * forward).sum())
+
+
+def boundaries(case: cases.Case, first: int, spp: int, terms: tuple[str, ...], kind: str = "bdpt_edge") -> np.ndarray:
+    """Only some terms, (RUNS, H, W, C)."""
+    scene = case.scene()
+    motion = Motion(scene, **case.motion)
+    it = mi.load_dict({"type": kind, "max_depth": case.max_depth, "sppc": 0})
+    it.TERMS = tuple(t for t in it.TERMS if t.name in ("interior", *terms))
+    return np.array([derivative_image(scene, it, motion, spp=spp, seed=first + i) for i in range(RUNS)], np.float64)
+
+
+def assert_pooled_equal(found: np.ndarray, expected: np.ndarray, least: float) -> None:
+    """Quarters of the film differ by noise alone, and their mean by little."""
+    h, w = (n // 2 for n in found.shape[1:3])
+    quarters = [a[:, : 2 * h, : 2 * w].reshape(RUNS, 2, h, 2, w, -1).mean((2, 4)) for a in (found, expected)]
+    means, errors = [a.mean(0) for a in quarters], [a.std(0, ddof=1) / np.sqrt(RUNS) for a in quarters]
+    error = np.hypot(*errors)
+    assert (np.abs(means[0] - means[1]) <= 6 * error + 1e-9).all()
+    assert error.mean() <= least * np.abs(means[1]).mean()
+
+
+def test_shadows_continued_from_the_light():
+    """A hard shadow on a floor that lights walls: as `prb_edge` has it."""
+    indirect = "shadows in indirect light"
+    found = boundaries(cases.case("door"), 0, 256, (indirect, f"{indirect}, continued"))
+    assert_pooled_equal(found, boundaries(cases.case("door"), 100, 256, (indirect,), "prb_edge"), 0.1)
+    continued = boundaries(cases.case("door"), 0, 16, (f"{indirect}, continued",))
+    assert np.abs(continued.mean()) > 0.1 * np.abs(found.mean())
+
+
+def test_shadows_in_light_from_surfaces(monkeypatch):
+    """Whatever is found from points, and what from surfaces: the sum has the same mean."""
+    terms = "edges from points", "shadows in light from surfaces"
+    density, found = shading_boundary.density_from_points, []
+    for scale in (0.01, 1e4):
+        for module in (shading_boundary, deep_shadows):
+            monkeypatch.setattr(module, "density_from_points", lambda *a, scale=scale: scale * density(*a))
+        found.append(boundaries(cases.case("spot_behind_screen"), 0 if scale < 1 else 100, 256, terms))
+        share = np.abs(boundaries(cases.case("spot_behind_screen"), 0, 16, terms[1:])).mean() / np.abs(found[-1]).mean()
+        assert (share > 0.1) == (scale < 1)
+    assert_pooled_equal(*found, 0.4)
 
 
 def test_image_is_that_of_bdpt():
