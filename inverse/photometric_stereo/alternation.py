@@ -21,6 +21,10 @@ from .rendering import Rendering
 #: Share of the newest interreflections in their running mean.
 AVERAGED = 0.25
 
+#: Paths of each image of interreflections, at least: small images have more samples per pixel than `spp`, and are
+#: smoothed less, at equal noise. Smoothing takes away what a fold reflects of the one beside it.
+PATHS = 2**16
+
 #: Exposures that seem to be off by less (logarithm) are taken as stated: shapes and BSDFs explain so much as well.
 STATED = 0.02
 
@@ -152,8 +156,9 @@ class Alternations:
         self.rendering.update(guess, depth)
         indirect = None
         if options.max_depth > 2:
-            indirect = self.rendering.indirect(spp=options.spp, seed=int(self.rng.integers(2**31)))
-            _smooth(indirect, self.data.mask, options.smoothing)
+            spp = max(options.spp, round(PATHS / self.data.mask.size))
+            indirect = self.rendering.indirect(spp=spp, seed=int(self.rng.integers(2**31)))
+            _smooth(indirect, self.data.mask, options.smoothing * np.sqrt(options.spp / spp))
             if before is not None:
                 indirect -= before
                 indirect *= max(1 / (number + 1), AVERAGED)

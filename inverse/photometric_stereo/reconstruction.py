@@ -64,9 +64,10 @@ class Options:
     max_depth: int = 3
     """Longest path: 2 is direct light, 3 adds one interreflection."""
     spp: int = 8
-    """Samples per pixel of interreflections."""
+    """Samples per pixel of interreflections, at least: small images have more."""
     smoothing: float = 1.5
-    """Smoothing of interreflections, whose noise the normals would inherit: standard deviation in pixels."""
+    """Smoothing of interreflections, whose noise the normals would inherit: standard deviation in pixels, at `spp`
+    samples. With more samples it is less."""
     resolutions: tuple[float, ...] = (0.25, 0.5, 1.0)
     """Sizes of the images, relative to the data."""
     iterations: tuple[int, ...] = (10, 6, 4)

@@ -120,6 +120,29 @@ def test_normals_of_halves_tell_a_wrong_model(matte: Dataset) -> None:
     assert np.isnan(judge.disagreement(guess, view.points, shown, None)).all()
 
 
+@pytest.mark.parametrize("spp", [8, 2000])
+def test_small_images_are_smoothed_less_at_equal_noise(
+    matte: Dataset, monkeypatch: pytest.MonkeyPatch, spp: int
+) -> None:
+    """Samples times the square of the width of the Gaussian is what the options say; `spp` is the fewest samples."""
+    lobes, counts = ggx.read_dictionary()[0], np.ones(matte.values.shape[:2], np.float32)
+    options = ps.Options(**{**QUICK, "max_depth": 3}, spp=spp, smoothing=1.5)
+    judge = Judge(matte, lobes, left_out(matte, 0), counts, 0, "trimmed")
+    work = alternation.Alternations(matte, lobes, Kind(), judge, options, np.random.default_rng(0))
+    asked = {}
+
+    def indirect(*, spp: int, seed: int) -> np.ndarray:
+        asked["spp"] = spp
+        return np.zeros_like(matte.values)
+
+    monkeypatch.setattr(work.rendering, "indirect", indirect)
+    monkeypatch.setattr(alternation, "_smooth", lambda pixels, mask, width: asked.update(width=width))
+    guess = start.guess(matte, lobes, counts, options)
+    work.view(guess, work.integrate(guess))
+    assert asked["spp"] == max(spp, round(alternation.PATHS / N**2))
+    assert asked["spp"] * asked["width"] ** 2 == pytest.approx(1.5**2 * spp)
+
+
 def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the halves of the lights say that the start is better, it is kept, and elsewhere the result."""
     states = []
