@@ -27,6 +27,10 @@ from .shading_boundary import density_from_points, look, turning
 from .shadow_boundary import LightPoint, LitEdge, ShadowBoundary, fall
 from .tracer import LightTracer, ShadingPoint
 
+#: How far from the vertex of the light subpath the line past an edge may end, in units of what both ways
+#: to draw it may differ by.
+CLOSE = 4
+
 
 class DeepShadows(ShadowBoundary):
     """Samples the shadows that points of paths see, in light from surfaces."""
@@ -108,8 +112,3 @@ class DeepShadows(ShadowBoundary):
         seen = (edge.sample.density > 0) & dr.any(edge.lit != 0)
         edge.active = dr.select(sender.through, seen, edge.active)
         return light, edge
-
-
-#: How far from the vertex of the light subpath the line past an edge may end, in units of what both ways
-#: to draw it may differ by.
-CLOSE = 4
