@@ -209,7 +209,7 @@ MUTANTS = [
     mutant(
         "film boundary: soft light from elsewhere than a lune counts",
         SCATTERING,
-        "active &= ~lune.active | (pdf > 0)",
+        "active &= ~directions.active | (pdf > 0)",
         "pass",
     ),
     mutant(

@@ -28,6 +28,7 @@ from rimlight.edge_sampling.projection.sensors import inside_frame
 from .crease import Crease, Directions, LuneOrCrease
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
+from .lune import Lune
 from .tracer import Tracer
 
 
@@ -59,7 +60,7 @@ class BoundaryPoints:
     weights  : of these rays.
     active   : mi.Bool, (N,)
     horizons : on which side of a horizon of interpolated normals each of the rays is; None where there are none.
-    lune : from where light is looked for on both sides, where it is active; None: as everywhere.
+    directions : from where light is looked for on both sides, where it is active; None: as everywhere.
     sensor_moves : does the velocity depend on parameters of the sensor?
     """
 
@@ -71,7 +72,7 @@ class BoundaryPoints:
     weights: list[mi.Spectrum]
     active: mi.Bool
     horizons: list[Horizon | None]
-    lune: Directions | None
+    directions: Directions | None
     sensor_moves: bool
 
 
@@ -133,7 +134,7 @@ class FilmBoundary:
             jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
             sides = zip((-1, 1), points.rays, points.met, points.weights, points.horizons, strict=True)
             for sign, ray, pi, weight, horizon in sides:
-                L, alpha = tracer.seen(ray, pi, sampler.clone(), points.active, horizon, points.lune)
+                L, alpha = tracer.seen(ray, pi, sampler.clone(), points.active, horizon, points.directions)
                 jump -= sign * L * weight
                 alpha_jump -= sign * alpha
             if points.sensor_moves:
@@ -180,16 +181,25 @@ class FilmBoundary:
             active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
             n_dl = dr.select(active, n_dl, 0)
-            lune = outlines.lune(at, chosen, lights)
-            if outlines.matt is not None and tracer.shares_directions:
-                bent = active & chosen.is_edge & dr.gather(mi.Bool, outlines.matt, chosen.edge)
-                if horizons[0] is not None:
-                    bent &= horizons[0].side == 0
-                crease = Crease.between(rays, met, bent)
-                lune = LuneOrCrease(lune, crease) if lune is not None else crease
-            return BoundaryPoints(u, n_dl, velocity, rays, met, weights, active, horizons, lune, at.projection.attached)
+            shared = outlines.lune(at, chosen, lights)
+            if tracer.shares_directions:
+                shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
+            sensor_moves = at.projection.attached
+            return BoundaryPoints(u, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
 
     # ---------------------- What is on their sides ----------------------
+
+    def _shared_directions(
+        self, chosen: Chosen, lune: Lune | None, rays, met, horizons, active: mi.Bool
+    ) -> Directions | None:
+        """In which directions both sides look for light: of a lune, or of the crease of a matt surface."""
+        if self.outlines.matt is None:
+            return lune
+        active = active & chosen.is_edge & dr.gather(mi.Bool, self.outlines.matt, chosen.edge)
+        if horizons[0] is not None:
+            active &= horizons[0].side == 0
+        crease = Crease.between(rays, met, active)
+        return crease if lune is None else LuneOrCrease(lune, crease)
 
     def _jumps_between(self, at: Placed, chosen: Chosen, found: Found, p, n, rays, met) -> mi.Bool:
         """Is what jumps between two rays beside the points a jump of theirs, and not of another outline close by?

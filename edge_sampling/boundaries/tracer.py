@@ -62,7 +62,7 @@ class Tracer(Protocol):
         sampler: mi.Sampler,
         active: mi.Bool,
         horizon: Horizon | None,
-        lune: Directions | None,
+        directions: Directions | None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, of which the first hit, `pi`, is on a side of a horizon. Where there is
         a lune, only light from there need be reflected: what else there is does not jump. At a crease, light is looked
@@ -76,13 +76,13 @@ class Tracer(Protocol):
         sampler: mi.Sampler,
         active: mi.Bool,
         beside_outline: mi.Bool | None = None,
-        lune: Lune | None = None,
+        directions: Lune | None = None,
         found: mi.Float | None = None,
     ) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`.
 
         beside_outline : is it met just inside of its outline? Then interpolated normals that face away are turned.
-        lune : where it is active, only light from there need be scattered.
+        directions : where it is active, only light from there need be scattered.
         found : density with which this is found so, over that with which it is by `DeepShadows`: infinite, never.
         """
 

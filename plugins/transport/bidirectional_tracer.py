@@ -84,11 +84,11 @@ class BidirectionalTracer(PathTracer):
         *,
         attached: bool,
         horizon: Horizon | None = None,
-        lune: Directions | None = None,
+        directions: Directions | None = None,
         pi: mi.PreliminaryIntersection3f | None = None,
     ) -> Radiance:
         if attached:
-            return super().radiance(ray, sampler, active, attached=True, horizon=horizon, lune=lune, pi=pi)
+            return super().radiance(ray, sampler, active, attached=True, horizon=horizon, directions=directions, pi=pi)
         pi = self.first_hit(ray, active) if pi is None else pi
 
         def turn(si, ray, active):
@@ -97,18 +97,21 @@ class BidirectionalTracer(PathTracer):
             if self.fine_mirrors is not None:
                 self.fine_mirrors.turn(si, ray, active)
 
-        by_lune = active & lune.active if lune is not None else None
-        others = active & ~by_lune if by_lune is not None else active
+        by_path = active & directions.active if directions is not None else None
+        others = active & ~by_path if by_path is not None else active
         found = self._connected(camera_vertex(ray, pi), sampler.clone(), others, turn, shines=True)
         L, valid = found[0], found[1] | (others & (self.scene.environment() is not None and not self.hide_emitters))
-        if by_lune is not None:
-            other = super().radiance(ray, sampler, by_lune, attached=False, horizon=horizon, lune=lune, pi=pi)
-            L, valid = dr.select(by_lune, other.L, L), valid | (by_lune & other.valid)
+        if by_path is not None:
+            options = {"attached": False, "horizon": horizon, "directions": directions, "pi": pi}
+            other = super().radiance(ray, sampler, by_path, **options)
+            L, valid = dr.select(by_path, other.L, L), valid | (by_path & other.valid)
         return Radiance(L, valid)
 
-    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None, lune=None, found=None) -> mi.Spectrum:
-        by_lune = active & lune.active if lune is not None else None
-        others = active & ~by_lune if by_lune is not None else active
+    def scattered(
+        self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None
+    ) -> mi.Spectrum:
+        by_path = active & directions.active if directions is not None else None
+        others = active & ~by_path if by_path is not None else active
 
         def turn(si, ray, active):
             if beside_outline is not None:
@@ -125,9 +128,9 @@ class BidirectionalTracer(PathTracer):
             one = dr.abs_dot(y.n, ray.d) / (found * dr.square(pi.t))
             shorter = Shorter(dr.select((found > 0) & dr.isfinite(one), one, 0), dr.zeros(mi.Float, dr.width(one)))
         L, _ = self._connected(vertex, sampler.clone(), others & pi.is_valid(), turn, shines=False, shorter=shorter)
-        if by_lune is not None:
-            other = super().scattered(ray, pi, depth, sampler, by_lune, beside_outline, lune)
-            L = dr.select(by_lune, other, L)
+        if by_path is not None:
+            other = super().scattered(ray, pi, depth, sampler, by_path, beside_outline, directions)
+            L = dr.select(by_path, other, L)
         return L
 
     def arriving(

@@ -57,14 +57,14 @@ def scattered_light(
     depths: Depths,
     active: mi.Bool,
     beside_outline: mi.Bool | None = None,
-    lune: Directions | None = None,
+    directions: Directions | None = None,
     lights: LightChoice | None = None,
     fine_mirrors: FineMirrors | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
     beside_outline : is this vertex just inside of an outline? Then interpolated normals that face away are turned.
-    lune : see `Scattering.scatter`, for this vertex.
+    directions : see `Scattering.scatter`, for this vertex.
     lights : see `Scattering`.
     fine_mirrors : of which the normals are turned at this vertex.
 
@@ -83,9 +83,9 @@ def scattered_light(
             turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
         if fine_mirrors is not None:
             fine_mirrors.turn(si, vertex.ray, active & (vertex.depth == first))
-        from_lune = lune.where(active & (vertex.depth == first)) if lune is not None else None
+        there = directions.where(active & (vertex.depth == first)) if directions is not None else None
         numbers = scattering.draw(sampler, active)
-        direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), numbers, active, lune=from_lune)
+        direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), numbers, active, directions=there)
         L += dr.select(active, vertex.β * direct, 0)
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)
         stopped |= (active & ~onwards.through) | scattering.stops(onwards.ray, onwards.pi, sampler, last)

@@ -95,18 +95,18 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
-        lune: Directions | None = None,
+        directions: Directions | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Direct illumination that `si` reflects, and the next vertex.
 
         vicinity : in which that slides; None: it is a material point.
         met : what the ray to it meets, if that is known.
-        lune : where it is active, directions are sampled from there, and only what comes from a lune is found. Only
-            where no gradients are carried.
+        directions : where it is active, directions are sampled from there, and only what comes from a lune is found.
+            Only where no gradients are carried.
         """
         chosen = self._choose(si, numbers, active)
-        from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, lune, chosen) if self.any else 0
-        from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met, lune, chosen)
+        from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, directions, chosen) if self.any else 0
+        from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met, directions, chosen)
         with dr.resume_grad(when=self.attached):
             return from_bsdf + from_emitter, onwards
 
@@ -119,9 +119,16 @@ class Scattering:
         return self.lights.choose(at.p, mi.Vector3f(facing), numbers.light.x, active)
 
     def sample_emitter(
-        self, si, bsdf, sample: mi.Point2f, active, lune: Directions | None = None, chosen: ChosenLight | None = None
+        self,
+        si,
+        bsdf,
+        sample: mi.Point2f,
+        active,
+        directions: Directions | None = None,
+        chosen: ChosenLight | None = None,
     ):
-        """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). lune : see `scatter`. chosen : which."""
+        """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). directions : see `scatter`. chosen : which
+        light."""
 
         def towards_light(active):
             if chosen is None:
@@ -130,9 +137,9 @@ class Scattering:
             ds.pdf *= chosen.p
             return ds, weight / chosen.p
 
-        return self.reflect(si, bsdf, towards_light, active, lune)
+        return self.reflect(si, bsdf, towards_light, active, directions)
 
-    def reflect(self, si, bsdf, towards_light, active, lune: Directions | None = None):
+    def reflect(self, si, bsdf, towards_light, active, directions: Directions | None = None):
         """Radiance reflected at `si` by what `towards_light` samples: mi.Spectrum, (N,).
 
         towards_light : maps `active` to a direction and the light from there over its density, as Mitsuba's
@@ -150,10 +157,10 @@ class Scattering:
                 weight = dr.replace_grad(weight, attached)
         with dr.resume_grad(when=self.attached):
             f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
-            if lune is not None:
-                pdf = dr.select(lune.active, lune.pdf(direction), pdf)
+            if directions is not None:
+                pdf = dr.select(directions.active, directions.pdf(direction), pdf)
                 # What comes from elsewhere is the same on both sides of an edge, unless a texture jumps there, too.
-                active &= ~lune.active | (pdf > 0)
+                active &= ~directions.active | (pdf > 0)
             mis = power_heuristic(ds.pdf, pdf)
             if len(self.held.smooth_lamps) and to_lamp is not None:
                 mis = to_lamp.attach(mis, ds.pdf, pdf, by_light=True)
@@ -213,13 +220,13 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
-        lune: Directions | None = None,
+        directions: Directions | None = None,
         chosen: ChosenLight | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
         vertex. The arguments are those of `scatter`. chosen : the light of the light sample there."""
         scene, context = self.scene, mi.BSDFContext()
-        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, vicinity, met, lune)
+        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, vicinity, met, directions)
         ray, pi, weight, mirrored = onwards.ray, onwards.pi, onwards.weight, onwards.mirrored
         active = active & dr.any(weight != 0)
         if not self.attached:
@@ -359,21 +366,21 @@ def next_vertex(
     active: mi.Bool,
     vicinity: Vicinity | None = None,
     met: mi.PreliminaryIntersection3f | None = None,
-    lune: Directions | None = None,
+    directions: Directions | None = None,
 ) -> tuple[mi.BSDFSample3f, Next]:
     """A direction sampled from the BSDF, and the vertex there. Detached.
 
     vicinity : in which that slides.
     met : what the ray to it meets, if that is known.
-    lune : where it is active, the direction is sampled from there. The BSDF has no perfect reflection, and lets nothing
-        through.
+    directions : where it is active, the direction is sampled from there. The BSDF has no perfect reflection, and lets
+        nothing through.
     """
     bs, weight = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, active)
-    if lune is not None:
-        ω, pdf = lune.sample(numbers.lobe, numbers.direction)
-        bs.wo, bs.pdf = dr.select(lune.active, si.to_local(ω), bs.wo), dr.select(lune.active, pdf, bs.pdf)
-        there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & lune.active) / pdf
-        weight = dr.select(lune.active, there, weight)
+    if directions is not None:
+        ω, pdf = directions.sample(numbers.lobe, numbers.direction)
+        bs.wo, bs.pdf = dr.select(directions.active, si.to_local(ω), bs.wo), dr.select(directions.active, pdf, bs.pdf)
+        there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & directions.active) / pdf
+        weight = dr.select(directions.active, there, weight)
     active = active & dr.any(weight != 0)
     through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
     ray = spawn_ray(scene, si, si.to_world(bs.wo), through)

@@ -73,14 +73,14 @@ class PathTracer:
         *,
         attached: bool,
         horizon: Horizon | None = None,
-        lune: Directions | None = None,
+        directions: Directions | None = None,
         pi: mi.PreliminaryIntersection3f | None = None,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
 
         pi : their first hits, if these are known.
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
-        lune : see `Scattering.scatter`, for the first hit.
+        directions : see `Scattering.scatter`, for the first hit.
         """
         scene = self.scene
         active = active & (self.depths.max_depth > 0)
@@ -107,7 +107,9 @@ class PathTracer:
         # ---------------------- Light that it scatters ----------------------
 
         vicinity = Vicinity.of(pi, self.glass) if attached and self.scatters(2) else None
-        direct, onwards = scattering.scatter(si, bsdf, scattering.draw(sampler, active), active, vicinity, lune=lune)
+        direct, onwards = scattering.scatter(
+            si, bsdf, scattering.draw(sampler, active), active, vicinity, directions=directions
+        )
         with dr.resume_grad(when=attached):
             L += direct
         valid = backdrop | (active & ~onwards.through)
@@ -141,10 +143,10 @@ class PathTracer:
         sampler: mi.Sampler,
         active: mi.Bool,
         horizon: Horizon | None,
-        lune: Directions | None,
+        directions: Directions | None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, detached."""
-        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, lune=lune, pi=pi)
+        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, directions=directions, pi=pi)
         return found.L, dr.select(found.valid, mi.Float(1), 0)
 
     # ---------------------- From points of a path ----------------------
@@ -167,16 +169,18 @@ class PathTracer:
         c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass)
         return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.since < c.depth, c.vicinity, c.density), c
 
-    def scattered(self, ray, pi, depth, sampler, active, beside_outline=None, lune=None, found=None) -> mi.Spectrum:
+    def scattered(
+        self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None
+    ) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`. Detached.
 
         ray, pi : the ray and what it meets. sampler : for the paths beyond. active : mi.Bool, (N,)
         beside_outline : mi.Bool, (N,), is it met just inside of its outline?
-        lune : see `Scattering.scatter`, for what the ray meets. found : of no use here, see `Tracer`.
+        directions : see `Scattering.scatter`, for what the ray meets. found : of no use here, see `Tracer`.
         """
         one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
-        turned = beside_outline, lune, self.lights, self.fine_mirrors
+        turned = beside_outline, directions, self.lights, self.fine_mirrors
         return scattered_light(self.scene, sampler, beyond, self.depths, active, *turned)[0]
 
     def arriving(
