@@ -38,7 +38,7 @@ class DeepShadows(ShadowBoundary):
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
         super().__init__(scene, silhouettes)
         #: All light subpaths as one light, which is on surfaces.
-        self.chosen, self.spots = dr.opaque(mi.UInt32, 0), []
+        self.chosen, self.spots = dr.opaque(mi.UInt32, 0), {}
         self.any_surface, self.any_other = True, False
 
     def at(

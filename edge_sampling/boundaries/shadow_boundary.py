@@ -77,9 +77,9 @@ class ShadowBoundary:
     silhouettes : what throws shadows; refitted by the caller.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(
-        ("silhouettes", "lights", "smooth_lamps", "chosen", "any_surface", "any_other")
-    )  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(  # for `dr.freeze`
+        ("silhouettes", "lights", "smooth_lamps", "chosen", "any_surface", "any_other", "spots")
+    )
 
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
         self.silhouettes = silhouettes
@@ -89,10 +89,10 @@ class ShadowBoundary:
         self.chosen = mi.UInt32([k for k, i in enumerate(self.lights.emitter) if self.counts(emitters[i])])
         on_surface = {bool(e.flags() & mi.EmitterFlags.Surface) for e in emitters if self.counts(e)}
         self.any_surface, self.any_other = True in on_surface, False in on_surface
-        #: Spots, and their numbers in `Lights`: edges outside of their beams throw no shadow in their light.
-        self.spots = [(k, emitters[i]) for k, i in enumerate(self.lights.emitter) if is_spot(emitters[i])]
         far = any(e.flags() & mi.EmitterFlags.Infinite for e in emitters if self.counts(e))
-        self.spots = [] if far else self.spots
+        spots = [(k, emitters[i]) for k, i in enumerate(self.lights.emitter) if is_spot(emitters[i])]
+        #: Spots by their numbers in `Lights`: edges outside of their beams throw no shadow in their light.
+        self.spots = {} if far else dict(spots)
 
     def counts(self, emitter: mi.Emitter) -> bool:
         """Are the shadows in its light sampled?"""
@@ -220,7 +220,7 @@ class ShadowBoundary:
         if not self.spots:
             return None
         cone = Cone(mi.Vector3f(0, 0, 1), mi.Float(-1), mi.Float(0))
-        for number, emitter in self.spots:
+        for number, emitter in self.spots.items():
             params = mi.traverse(emitter)
             sin, cos = dr.sincos(dr.detach(dr.deg2rad(params["cutoff_angle"])) * (1 + SLACK))
             axis = dr.normalize(dr.detach(params["to_world"]) @ mi.Vector3f(0, 0, 1))

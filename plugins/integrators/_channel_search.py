@@ -37,7 +37,7 @@ class ChannelSearch(BoundarySearch):
     """
 
     def __init__(self, who: str, channels: tuple[Channel, ...]):
-        super().__init__(who, Depths(1, 1), planes=False, from_points=False)
+        super().__init__(who, Depths(1, 1), planes=False, from_points=False, from_surfaces=False)
         self.channels = channels
         self.kinds = {c.kind for c in channels}
 
