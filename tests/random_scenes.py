@@ -53,7 +53,7 @@ SQUARE, LARGEST = 5, 5.5
 
 #: What scenes may have besides, and what that is.
 SPECIAL = {
-    "cut": "meshes stand in the floor, and in each other; none of them is a lamp",
+    "cut": "things stand in the floor, and in each other; none of them is a lamp",
     "jumps": "all that things have are perfect mirrors, smooth glass, and textures that jump",
     "instances": "there are two or three instances of meshes besides, which mostly are what moves",
     "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
@@ -405,8 +405,7 @@ class Generator:
         centre = [[-0.9, 0.5, 0], [0.9, 0.7, -0.3], [0, 1.6, 0.4]][i] + self.rng.uniform(-0.1, 0.1, 3)
         size, q = self.uniform(0.35, 0.55), self.rotation()
         if self.special == "cut":
-            analytic = kind in ("sphere", "cylinder", "disk")
-            centre = np.add(centre, [0, 1.4, 0]) if analytic else centre * [0.4, 0, 1] + [0, 0.5 * size - 0.4, 0]
+            centre = centre * [0.4, 0, 1] + [0, 0.5 * size - 0.4, 0]
         closed = kind not in ("quad", "half", "disk", "cylinder", "needle")
         uv = kind not in ("sphere", "cylinder", "disk", "tetra") and self.chance(0.6)
         material, bsdf = self.bsdf(uv, closed and kind != "torus")
