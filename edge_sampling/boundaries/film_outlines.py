@@ -10,7 +10,7 @@ import numpy as np
 
 from rimlight.edge_sampling.geometry.curves import CurvePoint, Curves
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
-from rimlight.edge_sampling.geometry.edges import Edges
+from rimlight.edge_sampling.geometry.edges import EdgeKind, Edges
 from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
@@ -25,6 +25,9 @@ LENGTH_UNIT = 2.0**-16
 
 #: Creases of matt surfaces are chosen by their length times the sine of their angle, but at least times this.
 LEAST = 0.05
+
+#: And only where there are so many.
+FINE = 100
 
 
 @dataclass
@@ -100,9 +103,10 @@ class FilmOutlines:
         #: Which edges are on meshes that reflect light from all directions, but from behind?
         spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes] or [False])
         self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
-        #: And which on meshes that are matt?
+        #: And which on meshes that are matt? None where these have few creases, and there is little to gain.
         matt = np.array([m.bsdf() is not None and is_matt(m.bsdf()) for m in geometry.meshes])[edges.mesh].all(1)
-        self.matt = mi.Bool(matt) if len(edges) and matt.any() else None
+        creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
+        self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
         shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
         shapes = tuple(s for s, moves in shapes if moves)
         self.curves = Curves(shapes, seams=seams) if shapes else None
