@@ -104,7 +104,8 @@ class FilmOutlines:
         spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes] or [False])
         self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
         #: And which on meshes that are matt? None where these have few creases, and there is little to gain.
-        matt = np.array([m.bsdf() is not None and is_matt(m.bsdf()) for m in geometry.meshes])[edges.mesh].all(1)
+        matt = np.array([m.bsdf() is not None and is_matt(m.bsdf()) for m in geometry.meshes] or [False])
+        matt = matt[edges.mesh].all(1)
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
         shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from building import diffuse, horizontal, mesh, scene
+from building import camera, constant, diffuse, horizontal, mesh, scene
 from random_scenes import ball
 
 from rimlight.edge_sampling import CutCurves, Geometry
@@ -111,3 +111,30 @@ def test_fine_meshes():
     assert odd == 0
     assert off < 1e-6
     assert length == pytest.approx(of_spheres, rel=0.01)
+
+
+def test_a_scene_without_meshes():
+    """Two spheres that cut each other, and nothing else: their motion looks like the opposite one of the camera."""
+    sphere = lambda x, r, colour: {"type": "sphere", "center": [x, 0.3 * x, 0], "radius": r, "bsdf": diffuse(colour)}
+    integrator = mi.load_dict({"type": "direct_edge"})
+
+    def runs(keys: list[str], step: float, first: int = 0) -> np.ndarray:
+        s = scene(sensor=camera(), a=sphere(0, 0.6, 0.2), b=sphere(0.5, 0.5, 0.8), sky=constant())
+        params, found = mi.traverse(s), []
+        params.keep(keys)
+        start = {k: mi.Transform4f(params[k]) for k in keys}
+        for seed in range(first, first + 12):
+            θ = dr.opaque(mi.Float, 0)
+            dr.enable_grad(θ)
+            for k in keys:
+                params[k] = mi.Transform4f().translate(mi.Vector3f(step, 0, 0) * θ) @ start[k]
+            params.update()
+            dr.forward(θ, dr.ADFlag.ClearEdges)
+            found.append(np.array(integrator.render_forward(s, params, seed=seed, spp=64), np.float64))
+        return np.array(found)
+
+    spheres, sensor = runs(["a.to_world", "b.to_world"], 1.0), runs(["sensor.to_world"], -1.0)
+    weight = runs(["sensor.to_world"], -1.0, first=100).mean(0)
+    p, q = ((r * weight).sum((1, 2, 3)) / (weight**2).sum() for r in (spheres, sensor))
+    assert abs(p.mean() - q.mean()) < 0.01 + 4 * np.hypot(p.std(), q.std()) / len(p) ** 0.5
+    assert q.mean() > 0.9
