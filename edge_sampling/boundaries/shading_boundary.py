@@ -162,9 +162,7 @@ class ShadingBoundary:
                 # group.
                 still = dr.select(moves | point.slides, 1, dr.select(emitted, 0, STILL))
                 use = [1, still][: self.silhouettes.groups]
-                e = self.silhouettes.sample(
-                    placement, towards, sampler, use, choice=part, from_light=False, active=active
-                )
+                e = self.silhouettes.sample(placement, towards, sampler, use, choice=part, active=active)
                 outline = self.silhouettes.point(placement, e, si.p)
                 d = outline.p - si.p
                 r2 = dr.squared_norm(d)

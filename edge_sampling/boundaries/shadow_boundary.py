@@ -212,7 +212,7 @@ class ShadowBoundary:
         active = (light.density > 0) & dr.isfinite(light.density)
         # Shadows of edges that stand still matter only on what moves.
         use = [1, 0.2][: silhouettes.groups]
-        e = silhouettes.sample(placement, view, sampler, use, choice=light.choice, from_light=True, active=active)
+        e = silhouettes.sample(placement, view, sampler, use, choice=light.choice, active=active)
         return self._edge_at(placement, light, e)
 
     def _beam(self, light: LightPoint) -> Cone | None:

@@ -15,8 +15,10 @@ from .views import View
 FLOOR = 0.01
 
 
-def importance(node: Node, view: View, from_light: bool) -> mi.Float:
+def importance(node: Node, view: View) -> mi.Float:
     """About what the boundaries among the edges of a node contribute; 0 only where they certainly contribute nothing.
+
+    Under an angle of length / r, an edge is seen; and the closer it is, the faster its direction turns, by 1 / r again.
 
     The number of sign changes of q·y among pairs of planes with mean μ, variance V, and a difference of second moment
     D is, for normally distributed planes, √(D/V) / π · exp(−μ² / 2V), where μ, V, D stand for μ·y, yᵀVy and yᵀDy.
@@ -68,11 +70,11 @@ def importance(node: Node, view: View, from_light: bool) -> mi.Float:
         # Where the cone has no axis at the node, or the node no extent, it is as good as inside.
         certain = cone.everything | (off2 == 0) | (extent == 0)
         weight *= dr.select(certain, 1, inside * narrow2 / (narrow2 + size2 / 3))
-    result = length * weight * (dr.rcp(r2) if from_light else dr.rsqrt(r2))
+    result = length * weight * dr.rcp(r2)
     return dr.select(possible & (length > 0) & dr.isfinite(result), result, 0)
 
 
-def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
+def edge_importance(slot: Slot, view: View) -> mi.Float:
     """What `importance` is for a node, for a single edge. Zero where that is no boundary."""
     a, b, start, end = part_in_view(slot, view)
     length_a, length_b = dr.norm(a), dr.norm(b)
@@ -91,14 +93,16 @@ def edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
     across = dr.norm(dr.cross(a, b))
     # Twice the tangent of half the angle under which the edge is seen: near enough to the angle, but for large ones.
     angle = dr.minimum(2 * across / (product + dr.dot(a, b)), dr.pi)
-    cosine = dr.clip(0.5 * (above[0] / length_a + above[1] / length_b), 0, 1) + MARGIN[from_light]
+    cosine = dr.clip(0.5 * (above[0] / length_a + above[1] / length_b), 0, 1) + MARGIN
     result = view.wide * angle * dr.select(everywhere, 1, cosine)
+    e = b - a
+    length = dr.norm(e)
+    h = across / length
     for lobe in view.lobes:
-        e = b - a
-        length = dr.norm(e)
-        result += narrow(lobe, a, e / length, length, across / length).total
-    if from_light:
-        result *= dr.rsqrt(product)
+        result += narrow(lobe, a, e / length, length, h).total
+    # The mean of 1 / r over the angle, which is ∫ cos φ dφ / h: where rounding spoils it, within its bounds.
+    mean = (dr.dot(b, e) / length_b - dr.dot(a, e) / length_a) / (across * angle)
+    result *= dr.clip(mean, dr.rcp(dr.maximum(length_a, length_b)), dr.rcp(h))
     if view.far is not None:
         # Not the angle, but the extent across the direction of view.
         across = dr.select(view.far, dr.norm(dr.cross(slot.b - slot.a, view.p)), across)

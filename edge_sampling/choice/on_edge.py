@@ -12,9 +12,9 @@ from rimlight.edge_sampling.geometry.device_edges import EDGE_ON
 from .edge_tree import Slot
 from .views import Cone, Lobe, View
 
-#: Added to the cosine of an edge, by whether a light looks: it stands for all of the edge, and the normal at a shading
-#: point may be that of the face, not of the shading.
-MARGIN = {False: 0.05, True: 0.02}
+#: Added to the cosine of an edge: it stands for all of the edge, and the normal at a shading point may be that of the
+#: face, not of the shading.
+MARGIN = 0.05
 
 
 @dataclass
@@ -69,7 +69,7 @@ def _on_line(a: mi.Vector3f, b: mi.Vector3f, view: View) -> list[_Wide | _Narrow
     start = dr.atan2(-foot, h)
     angle = dr.maximum(dr.atan2(length - foot, h) - start, 1e-7)
     middle = dr.normalize(a + 0.5 * length * e)
-    cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(dr.dot(view.n, middle), 0, 1) + MARGIN[False])
+    cosine = dr.select(dr.all(view.n == 0), 1, dr.clip(dr.dot(view.n, middle), 0, 1) + MARGIN)
     wide = _Wide(foot, h, start, angle, view.wide * cosine * angle)
     return [wide, *(narrow(lobe, a, e, length, h) for lobe in view.lobes)]
 

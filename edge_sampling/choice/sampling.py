@@ -34,7 +34,6 @@ def sample_edge(
     use: list[mi.Float | float],
     *,
     choice: mi.Float,
-    from_light: bool,
     active: mi.Bool,
 ) -> EdgeSample:
     """Descend the tree at random, in proportion to the importance of the children of each node; test the edges of the
@@ -42,16 +41,15 @@ def sample_edge(
 
     use : for each group of edges of the tree, how much to prefer it; 0: do not choose from it.
     choice : uniform in [0, 1); makes the first choices, so it pays to stratify it.
-    from_light : the importance of an edge falls off with the square of its distance, not with the distance itself.
 
     Returns
     -------
     EdgeSample, (N,)
     """
-    descent = _choose_group(tree, view, use, mi.Float(choice), from_light, mi.Bool(active))
+    descent = _choose_group(tree, view, use, mi.Float(choice), mi.Bool(active))
     if max(tree.depths) > 0:
-        descent = _down_to_a_leaf(tree, view, descent, sampler, from_light)
-    return _edge_of_the_leaf(tree, view, descent, sampler, from_light)
+        descent = _down_to_a_leaf(tree, view, descent, sampler)
+    return _edge_of_the_leaf(tree, view, descent, sampler)
 
 
 @dataclass
@@ -73,7 +71,7 @@ class _Descent:
     leaf_offset: mi.UInt32
 
 
-def _choose_group(tree: EdgeTree, view: View, use, choice: mi.Float, from_light: bool, active: mi.Bool) -> _Descent:
+def _choose_group(tree: EdgeTree, view: View, use, choice: mi.Float, active: mi.Bool) -> _Descent:
     """The root of one of the trees."""
     density, total = mi.Float(1), mi.Float(0)
     bottom, node_offset, leaf_offset = mi.UInt32(1), mi.UInt32(0), mi.UInt32(0)
@@ -81,7 +79,7 @@ def _choose_group(tree: EdgeTree, view: View, use, choice: mi.Float, from_light:
         weight = mi.Float(preference)
         # A few edges are tested faster than their node.
         if len(use) > 1 and max(tree.depths) > 0:
-            weight *= importance(tree.node(tree.device_node_offsets[k] + 1), view, from_light)
+            weight *= importance(tree.node(tree.device_node_offsets[k] + 1), view)
         total += weight
         p = dr.select(total > 0, weight / total, 0)
         taken = choice < p
@@ -94,10 +92,10 @@ def _choose_group(tree: EdgeTree, view: View, use, choice: mi.Float, from_light:
     return _Descent(root, density, choice, active & (total > 0), bottom, node_offset, leaf_offset)
 
 
-def _down_to_a_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler, from_light: bool) -> _Descent:
+def _down_to_a_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler) -> _Descent:
     def down(node, density, choice, alive, sampler):
         child = 2 * node
-        weights = [importance(tree.node(child + k + at.node_offset, alive), view, from_light) for k in (0, 1)]
+        weights = [importance(tree.node(child + k + at.node_offset, alive), view) for k in (0, 1)]
         total = weights[0] + weights[1]
         alive &= total > 0
         choice = _renewed(choice, density, sampler, alive)
@@ -117,14 +115,14 @@ def _down_to_a_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sample
     return replace(at, node=node, density=density, choice=choice, alive=alive)
 
 
-def _edge_of_the_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler, from_light: bool) -> EdgeSample:
+def _edge_of_the_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler) -> EdgeSample:
     width, alive = dr.width(view.p), at.alive
     choice = _renewed(at.choice, at.density, sampler, alive)
     first = (at.node - at.bottom + at.leaf_offset) * LEAF
 
     def test(k, total, chosen, weight, choice):
         slot = tree.slot(first + k, alive)
-        w = edge_importance(slot, view, from_light)
+        w = edge_importance(slot, view)
         total += w
         p = dr.select(total > 0, w / total, 0)
         taken = choice < p

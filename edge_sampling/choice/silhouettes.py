@@ -125,13 +125,12 @@ class Silhouettes:
         use: list[mi.Float | float],
         *,
         choice: mi.Float,
-        from_light: bool,
         active: mi.Bool,
     ) -> EdgeSample:
         """Choose an edge or a curve, and a point on it: `sample_edge`, which tells the arguments. Pieces of curves are
         numbered after the edges."""
         if self.curves is None:
-            return sample_edge(self.tree, view, sampler, use, choice=choice, from_light=from_light, active=active)
+            return sample_edge(self.tree, view, sampler, use, choice=choice, active=active)
         part = CURVE_PART if self.tree is not None else 1.0
         on_curve = choice < part
         curve = self._sample_curve(placement, view, sampler, dr.minimum(choice / part, dr.one_minus_epsilon(mi.Float)))
@@ -139,9 +138,7 @@ class Silhouettes:
         if self.tree is None:
             return curve
         choice = dr.clip((choice - part) / (1 - part), 0, dr.one_minus_epsilon(mi.Float))
-        edge = sample_edge(
-            self.tree, view, sampler, use, choice=choice, from_light=from_light, active=active & ~on_curve
-        )
+        edge = sample_edge(self.tree, view, sampler, use, choice=choice, active=active & ~on_curve)
         edge.density *= 1 - part
         return dr.select(on_curve, curve, edge)
 

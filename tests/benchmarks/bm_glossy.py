@@ -197,7 +197,7 @@ def _weights(
 
     def draw(k: mi.Float | int, sampler: mi.Sampler) -> EdgeSample:
         part = (choice + k) / candidates
-        return sample_edge(tree, view, sampler, [1], choice=part, from_light=False, active=active)
+        return sample_edge(tree, view, sampler, [1], choice=part, active=active)
 
     def length_by_distance(e: EdgeSample) -> mi.Float:
         a, b = tree.device_edges.end_points(positions, e.edge)

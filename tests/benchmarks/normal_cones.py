@@ -63,7 +63,7 @@ def cones(tree: EdgeTree) -> np.ndarray:
     return found
 
 
-def _importance(node: Node, view: View, from_light: bool) -> mi.Float:
+def _importance(node: Node, view: View) -> mi.Float:
     lower, upper = mi.Vector3f(node.lower), mi.Vector3f(node.upper)
     d = 0.5 * (lower + upper) - view.p
     distance, radius = dr.norm(d), 0.5 * dr.norm(upper - lower)
@@ -76,13 +76,12 @@ def _importance(node: Node, view: View, from_light: bool) -> mi.Float:
     return importance(
         replace(node, silhouettes=mi.Float(0), always=length, plane_lower=[-1] * 4, plane_upper=[1] * 4),
         view,
-        from_light,
     )
 
 
-def _edge_importance(slot: Slot, view: View, from_light: bool) -> mi.Float:
+def _edge_importance(slot: Slot, view: View) -> mi.Float:
     n, m = (plane.xyz for plane in slot.planes)
     node = EdgeTree._single(slot)
     axis = (n + m) * dr.rsqrt(dr.maximum(dr.squared_norm(n + m), 1e-12))
     node.cone = mi.Vector4f(axis.x, axis.y, axis.z, dr.safe_asin(0.5 * dr.norm(n - m)))
-    return _importance(node, view, from_light)
+    return _importance(node, view)

@@ -240,7 +240,6 @@ def draw(
     lobes=(),
     cone=None,
     use=None,
-    from_light: bool = False,
     candidates: int = 1,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edges, parameters and densities of samples as seen from p. Lobes are (axis, peak, width), cones (axis, angle). Of
@@ -261,7 +260,7 @@ def draw(
 
     def sample(k, sampler):
         part = (choice + k) / candidates
-        return sample_edge(setup.tree, view, sampler, use, choice=part, from_light=from_light, active=mi.Bool(True))
+        return sample_edge(setup.tree, view, sampler, use, choice=part, active=mi.Bool(True))
 
     def length_by_distance(e):
         a, b = setup.tree.device_edges.end_points(setup.geometry.positions(), e.edge)
@@ -311,16 +310,16 @@ TOWARDS_IT = unit(-1, 0.2, 0.1)
 LOBE = (unit(1, 0.2, 0.3), 20, 0.01)
 VIEWS = {
     "far": ("bumpy", (4, 1, 0.5), {}),
-    "far from a light": ("bumpy", (4, 1, 0.5), {"n": TOWARDS_IT, "from_light": True}),
+    "far, above a plane": ("bumpy", (4, 1, 0.5), {"n": TOWARDS_IT}),
     "near": ("bumpy", (1.3, 0, 0.2), {}),
-    "near from a light": ("bumpy", (1.3, 0, 0.2), {"n": TOWARDS_IT, "from_light": True}),
+    "near, above another plane": ("bumpy", (1.3, 0, 0.2), {"n": TOWARDS_IT}),
     "near, above a plane": ("bumpy", (1.3, 0, 0.2), {"n": unit(0, 0.3, 1)}),
     "in the box": ("bumpy", (0.8, 0.8, 0.8), {}),
-    "in the box from a light": ("bumpy", (0.8, 0.8, 0.8), {"n": TOWARDS_IT, "from_light": True}),
+    "in the box, above a plane": ("bumpy", (0.8, 0.8, 0.8), {"n": TOWARDS_IT}),
     "lobe": ("bumpy", (-3, 0, -0.5), {"lobes": [LOBE]}),
     "lobe only": ("bumpy", (-3, 0, -0.5), {"lobes": [(unit(1, 0.2, 0.3), 1, 0.05)], "wide": 0}),
     "still life": ("still life", (0, 2, -4), {}),
-    "still life from a light": ("still life", (0, 2, -4), {"n": unit(0.2, -0.3, 1), "from_light": True}),
+    "still life, above a plane": ("still life", (0, 2, -4), {"n": unit(0.2, -0.3, 1)}),
     "still life, inside of the sphere": ("still life", (3, 0.5, 0.3), {}),
     "still life, below the sheet": ("still life", (0.2, 3.1, 0.3), {"n": unit(0.2, -1, 0.5)}),
     "still life, in the cube": ("still life", (0.1, 0, 0), {}),
@@ -343,14 +342,13 @@ def test_every_boundary_is_sampled_as_often_as_its_density_says(scenes, scene, p
     assert_unbiased(setup, p, draw(setup, p, 2**20, **options), n=options.get("n"))
 
 
-@pytest.mark.parametrize("from_light", [False, True])
-def test_groups_are_sampled_where_they_are_wanted(from_light):
+def test_groups_are_sampled_where_they_are_wanted():
     """The second group only by every other sample."""
     first = len(find_edges(Geometry(still_life()[:1], ())))
     setup = tree_over(*still_life(), groups=lambda edges: [np.arange(first, len(edges)), np.arange(first)])
     count, p = 2**19, (-0.5, 2, -4)
     both = np.arange(count) % 2 == 0
-    samples = draw(setup, p, count, use=[True, mi.Bool(both)], from_light=from_light)
+    samples = draw(setup, p, count, use=[True, mi.Bool(both)])
     assert_unbiased(setup, p, samples, both)
     assert_unbiased(setup, p, samples, ~both, slice(first, None))
 
@@ -430,7 +428,7 @@ def chi_squared(edge: np.ndarray, t: np.ndarray, density: np.ndarray, bins: int 
 
 FREQUENCIES = {
     "far": ("bumpy", (4, 1, 0.5), {}),
-    "near from a light": ("bumpy", (1.3, 0, 0.2), {"n": TOWARDS_IT, "from_light": True}),
+    "near, above another plane": ("bumpy", (1.3, 0, 0.2), {"n": TOWARDS_IT}),
     "all around": ("still life", (0.2, 3.1, 0.3), {}),
     "narrow lobe": ("bumpy", (1.3, 0, 0.2), {"lobes": [(unit(-0.3, 0.9, 0.15), 3000, 0.01)]}),
     "narrow lobe beside an edge": ("still life", (0, 2, -4), {"lobes": [(unit(0.05, 1.2, 4), 3000, 0.01)]}),
