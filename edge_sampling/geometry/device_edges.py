@@ -40,8 +40,8 @@ class DeviceEdges:
     """
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
-    _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
-    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_through", "_first_line")
+    _OF_EDGES = ("_ends", "_part", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
+    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_joined", "_any_through", "_first_line")
     DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
@@ -60,7 +60,7 @@ class DeviceEdges:
         glass, mask = (np.array([is_so(m) for m in geometry.meshes] or [False])[edges.mesh].any(1) for is_so in KINDS)
         self._glass, self._mask = mi.Bool(glass & ~edges.is_line), mi.Bool(mask & ~edges.is_line)
         #: Is there an edge beside which `farther` is not 0?
-        self.any_farther = bool((glass | mask | edges.is_line).any())
+        self.any_farther = bool((glass | mask | edges.is_line | edges.joined).any())
         #: Are there lines in which shapes cut through each other?
         self._any_lines = bool(edges.is_line.any())
         #: The curves among them, which come first.
@@ -71,6 +71,11 @@ class DeviceEdges:
         #: Is there a surface that lets rays through?
         self._any_through = any(lets_rays_through(s) for s in shapes)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
+        #: Are there edges made of sides that lie on one another (`close_cracks`), and of which parts of these?
+        self._any_joined = bool(edges.joined.any())
+        number = lambda a: mi.Float(np.array(a))
+        ends = [[number(edges.part[:, side, k]) for k in (0, 1)] for side in (0, 1)]
+        self._part = ends if self._any_joined else None
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
         """End points of edges, world space; of split vertices the mean, so that all copies have a gradient."""
@@ -81,7 +86,18 @@ class DeviceEdges:
         return a, b
 
     def _points_of_side(self, positions, edge, side):
-        return (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, self._ends[side][k], edge)) for k in (0, 1))
+        a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, self._ends[side][k], edge)) for k in (0, 1))
+        if not self._any_joined:
+            return a, b
+        s, t = (dr.gather(mi.Float, part, edge) for part in self._part[side])
+        return dr.select(s == 0, a, dr.lerp(a, b, s)), dr.select(t == 1, b, dr.lerp(a, b, t))
+
+    def _crack(self, positions: mi.Float, edge: mi.UInt32) -> mi.Float | float:
+        """How far apart the two sides of an edge are at most: scene units. Known where some were joined."""
+        if not self._any_joined:
+            return 0.0
+        sides = [self._points_of_side(positions, edge, side) for side in (0, 1)]
+        return dr.maximum(*(dr.norm(p - q) for p, q in zip(*sides, strict=True)))
 
     def on_curve(self, positions: mi.Float, edge: mi.UInt32, t: mi.Float) -> tuple[mi.Bool, mi.Point3f, mi.Vector3f]:
         """Which edges are pieces of curves; their points t, world space, attached, and the derivatives with respect to
@@ -130,10 +146,10 @@ class DeviceEdges:
         """
         a, b = self.end_points(positions, edge)
         normals = [dr.normalize(dr.cross(b - a, o - a)) for o in self.opposite(positions, edge)]
-        covers, shown = [], []
+        covers, shown, crack = [], [], self._crack(positions, edge)
         for ray, si in zip(rays, met, strict=True):
             through = self._lets_through(si)
-            slack = rounding(p, ray.o)
+            slack = rounding(p, ray.o) + crack
             passed = [passes(ray, p, [a, b, o]) for o in self.opposite(positions, edge)]
             there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
             covers.append(passed[0] & passed[1])
@@ -219,6 +235,7 @@ class DeviceEdges:
         cotangent = dr.dot(first, second) / dr.norm(dr.cross(first, second))
         wedge = dr.select(of(self._glass) & of(self._two_faces), dr.clip(cotangent, 0, 1), 0)
         farther = dr.select(of(self._is_line), BESIDE_LINE, BEHIND * wedge) * lift(scene, p)
+        farther += self._crack(positions, edge)
         return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
 
     def is_smooth(self, edge: mi.UInt32) -> mi.Bool:

@@ -14,14 +14,14 @@ either side is *not* fixed to the line, as it is to an edge: both surfaces slide
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .device_edges import rounding
-from .edges import EdgeKind, Edges, Weld
+from .edges import WHOLE, EdgeKind, Edges, Weld
 from .meshes import Geometry, number_of, positions_of
 from .rigid_motion import Shapes
 
@@ -277,9 +277,10 @@ def line_edges(edges: Edges, n: int, vertices: int) -> Edges:
         kind=np.full(n, EdgeKind.JUMP, np.uint8),
         count=np.full(n, 4, np.uint32),
         is_line=np.ones(n, bool),
+        part=np.broadcast_to(WHOLE, (n, 2, 2)),
+        joined=np.zeros(n, bool),
     )
-    both = lambda name: np.concatenate([getattr(edges, name), getattr(lines, name)])
-    return Edges(*(both(f.name) for f in fields(Edges)))
+    return edges + lines
 
 
 def _each_once(found: list[mi.UInt32]) -> list[mi.UInt32]:

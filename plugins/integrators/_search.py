@@ -11,6 +11,7 @@ import numpy as np
 from rimlight._collection import collect_before
 from rimlight._plan import names
 from rimlight.edge_sampling import (
+    Cracks,
     CutCurves,
     DeepShadows,
     Edges,
@@ -26,6 +27,7 @@ from rimlight.edge_sampling import (
     Silhouettes,
     Sources,
     TextureLines,
+    close_cracks,
     find_welded_edges,
     objects_below,
 )
@@ -68,6 +70,7 @@ class BoundarySearch:
         self.from_points, self.from_surfaces = from_points, from_surfaces
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
+        self._cracks = Cracks.none()
         self._instances = Instances()
         self._curves: CutCurves | None = None
         self._lines: Intersections | None = None
@@ -135,7 +138,8 @@ class BoundarySearch:
         self.edges, weld = find_welded_edges(geometry)
         self._curves = CutCurves(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
-        self._sources = Sources(scene, found, geometry, self.edges, weld)
+        self.edges, self._cracks = close_cracks(geometry, self.edges, weld)
+        self._sources = Sources(scene, found, geometry, self.edges, weld, self._cracks)
         self._partial, self._media = PartialParameters(scene), Media(scene)
         self._maps = [m for s in surfaces(scene) for m in mapped_horizons(s)]
         self._bent = [(s, o) for s in surfaces(scene) for o in objects_below(s).values() if hasattr(o, "turns")]
@@ -212,7 +216,7 @@ class BoundarySearch:
         deep = None
         if shading is not None and self.from_surfaces and self.depths.scatters(3):
             deep = DeepShadows(scene, shading.silhouettes)
-        limits = lasting_limits(scene, self.geometry, self.edges, self.depths, moving, sppi, **abilities)
+        limits = lasting_limits(scene, self.geometry, self._cracks, self.depths, moving, sppi, **abilities)
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights
