@@ -154,6 +154,7 @@ TILT = {"key": "spike.vertex_positions", "direction": [0, 1, 0.7], "vertices": [
 BALL_SLIDES = {"key": "ball.to_world", "direction": [1, 0, 0.3]}
 BALL_SINKS = {"key": "ball.to_world", "direction": [0, -1, 0]}
 AXIS = {"key": "axis.to_world", "rotate": [0.3, 0.2, 1]}
+KNOB = {"key": "knob.to_world", "direction": [1, 0.2, 0.3]}
 BULB = {"key": "bulb.to_world", "direction": [0.3, 1, 0]}
 
 #: Of each case: scene, motion, step, max_depth.
@@ -181,5 +182,6 @@ CURVES: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "sunk_sphere_camera": (sunk_sphere, CAMERA, 3e-3, 2),
     "sunk_sphere_light": (sunk_sphere, BALL_SINKS, 3e-3, 3),
     "pillar_turns": (pillar, AXIS, 4e-3, 2),
+    "pillar_knob": (pillar, KNOB, 3e-3, 2),
     "cut_bulb": (cut_bulb, BULB, 4e-3, 2),
 }

@@ -254,6 +254,11 @@ class Intersections:
             sides = [mi.Point3f(lower + dr.select(cut, s * aside, 0)) for s in (1, -1)]
         return [*(_follow(p, first, second, cut) for p in (lower, upper)), *sides]
 
+    def normals(self, positions: mi.Float, line: mi.UInt32, p: mi.Point3f) -> list[mi.Vector3f]:
+        """Of both triangles; detached. p : not needed."""
+        corners = [dr.gather(mi.Point3f, dr.detach(positions), dr.gather(mi.UInt32, c, line)) for c in self.corners]
+        return [_normal(corners[:3]), _normal(corners[3:])]
+
     def as_edges(self, edges: Edges, vertices: int) -> Edges:
         """`edges`, and after them these lines, as edges that are boundaries from everywhere.
 
