@@ -263,6 +263,20 @@ class Media:
                     )
 
 
+def refuse_timed_sky(scene: mi.Scene, who: str) -> None:
+    """Refuse a light that Mitsuba 3.9 cannot sample in symbolic loops, before these raise an error that names nothing.
+
+    Raises
+    ------
+    RuntimeError : there is such a light.
+    """
+    timed = names(e for e in scene.emitters() if e.class_name() == "TimedSunskyEmitter")
+    if timed and dr.flag(dr.JitFlag.SymbolicLoops):
+        raise Refusal(
+            f"{who}: Mitsuba cannot sample {', '.join(timed)} (timed_sunsky) in symbolic loops. Replace it by sunsky."
+        )
+
+
 def coarse_lamps(scene: mi.Scene) -> list[str]:
     """What the derivative lacks of the light that smooth-shaded meshes throw: Mitsuba reckons it with interpolated
     normals, but faces turn away one after the other, each while its light is not yet 0."""

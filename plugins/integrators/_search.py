@@ -43,7 +43,7 @@ from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
-from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits
+from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits, refuse_timed_sky
 
 #: Parameters of a light that move the shadows in it, or the border of its beam.
 PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction", "cutoff_angle")
@@ -130,6 +130,7 @@ class BoundarySearch:
         if same:
             return
         self._refuse_while_recording()
+        refuse_timed_sky(scene, self.who)
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
         self.geometry = self.edges = self._curves = self._lines = self._sources = self._partial = self._media = None
         self._boundaries, self._beyond, self._maps, self._bent = {}, {}, [], []
