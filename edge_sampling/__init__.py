@@ -12,12 +12,12 @@ from .choice.edge_tree import EdgeTree
 from .choice.sampling import EdgeSample, Reservoir, sample_edge, stratified
 from .choice.silhouettes import Silhouettes
 from .choice.views import Cone, Lobe, View
+from .geometry.cracks import Cracks, close_cracks
 from .geometry.cut_curves import CutCurves
 from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .geometry.intersections import Intersections
 from .geometry.meshes import Geometry, objects_below
 from .geometry.sources import Sources
-from .geometry.t_junctions import t_junctions
 from .geometry.texture_lines import TextureLines, jumping_textures
 from .lights import Lights
 from .projection.film_parts import Batch, FilmPart, film_parts
@@ -28,6 +28,7 @@ __all__ = [
     "Batch",
     "BoundarySamples",
     "Cone",
+    "Cracks",
     "CutCurves",
     "DeepShadows",
     "EdgeKind",
@@ -56,6 +57,7 @@ __all__ = [
     "TextureLines",
     "View",
     "Weld",
+    "close_cracks",
     "film_parts",
     "find_edges",
     "find_welded_edges",
@@ -63,5 +65,4 @@ __all__ = [
     "objects_below",
     "sample_edge",
     "stratified",
-    "t_junctions",
 ]

@@ -117,6 +117,31 @@ def cut_bulb() -> mi.Scene:
     return scene(sensor=camera((0.4, 2.0, -3.6), (0, 0.5, 0)), bulb=bulb, board=board, floor=floor)
 
 
+def divided(at: int, corner, u, v) -> tuple[np.ndarray, np.ndarray]:
+    """A face that is divided in at × at quads: its vertices and triangles. Its normal is u × v."""
+    x, y = (g.ravel() / at for g in np.mgrid[: at + 1, : at + 1])
+    i = np.arange((at + 1) ** 2).reshape(at + 1, at + 1)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return np.asarray(corner) + x[:, None] * np.asarray(u) + y[:, None] * np.asarray(v), faces
+
+
+def patchwork() -> mi.Scene:
+    """T-junctions: the faces of a cube are divided 1, 2 and 3 times, each by itself, and so are a floor and a wall."""
+    x, y, z = turned = 0.8 * np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
+    lower, upper = -turned.sum(0) / 2 + [0.1, 0.7, 0], turned.sum(0) / 2 + [0.1, 0.7, 0]
+    sides = [(1, lower, y, x), (2, lower, z, y), (3, lower, x, z), (1, upper, -x, -y), (2, upper, -y, -z)]
+    points, triangles, count = [], [], 0
+    for side in (*sides, (3, upper, -z, -x)):
+        p, f = divided(*side)
+        points, triangles, count = [*points, p], [*triangles, f + count], count + len(p)
+    thing = mesh("cube", np.concatenate(points), np.concatenate(triangles), bsdf=diffuse(0.8, 0.5, 0.3))
+    colour = diffuse(0.5, 0.6, 0.7, two_sided=True)
+    floor = mesh("floor", *divided(3, (-2, 0, -2), (0, 0, 3), (4, 0, 0)), bsdf=colour)
+    wall = mesh("wall", *divided(2, (-2, 0, 1), (0, 2, 0), (4, 0, 0)), bsdf=diffuse(0.6, 0.4, 0.4, two_sided=True))
+    return scene(sensor=camera(*LOOK), cube=thing, floor=floor, wall=wall, lamp=lamp())
+
+
 SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0, 0.3]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
 SINK = {"key": "cube.vertex_positions", "direction": [0, -1, 0]}
@@ -129,6 +154,7 @@ TILT = {"key": "spike.vertex_positions", "direction": [0, 1, 0.7], "vertices": [
 BALL_SLIDES = {"key": "ball.to_world", "direction": [1, 0, 0.3]}
 BALL_SINKS = {"key": "ball.to_world", "direction": [0, -1, 0]}
 AXIS = {"key": "axis.to_world", "rotate": [0.3, 0.2, 1]}
+KNOB = {"key": "knob.to_world", "direction": [1, 0.2, 0.3]}
 BULB = {"key": "bulb.to_world", "direction": [0.3, 1, 0]}
 
 #: Of each case: scene, motion, step, max_depth.
@@ -144,6 +170,9 @@ CUTS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "cut_lamp": (cut_lamp, BOARD, 6e-3, 2),
     "knot": (knot, DEFORM, 4e-3, 2),
     "spike": (spike, TILT, 4e-3, 2),
+    "patchwork_turns": (patchwork, TURN, 6e-3, 2),
+    "patchwork_camera": (patchwork, CAMERA, 3e-3, 2),
+    "patchwork_light": (patchwork, SLIDE, 3e-3, 3),
 }
 
 #: The same, where spheres, disks and cylinders are cut.
@@ -153,5 +182,6 @@ CURVES: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "sunk_sphere_camera": (sunk_sphere, CAMERA, 3e-3, 2),
     "sunk_sphere_light": (sunk_sphere, BALL_SINKS, 3e-3, 3),
     "pillar_turns": (pillar, AXIS, 4e-3, 2),
+    "pillar_knob": (pillar, KNOB, 3e-3, 2),
     "cut_bulb": (cut_bulb, BULB, 4e-3, 2),
 }

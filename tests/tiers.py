@@ -26,7 +26,8 @@ MORE_CASES = (
     "led_moves distant_cube discs_lights discs_radius smooth_torus_sun sphere_sun sphere_light surroundings "
     "reflecting_ball light_out_of_frame sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
     "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
-    "hidden_picture box_behind_glass spike stretched_ball lampshade_wall sunk_sphere_slides pillar_turns"
+    "hidden_picture box_behind_glass spike patchwork_camera stretched_ball lampshade_wall sunk_sphere_slides "
+    "pillar_turns"
 )
 
 #: Slow tests, by how their names begin.

@@ -250,7 +250,9 @@ class FilmBoundary:
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = ulps * largest
         if self.outlines.edges is not None and self.outlines.edges.any_farther:
-            farther = self.outlines.edges.farther(scene, at.positions, chosen.edge, p)
+            viewer = projection.viewer(at.aperture_sample)
+            to_viewer = mi.Vector3f(viewer) if projection.orthographic else viewer - p
+            farther = self.outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)
             in_world += dr.select(chosen.is_edge, farther, 0)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = ulps * max(projection.crop_size + projection.crop_offset)

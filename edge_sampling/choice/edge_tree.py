@@ -116,7 +116,8 @@ class EdgeTree:
         self.device_edges = DeviceEdges(edges, geometry)
         position = geometry.host_positions()
         ends = position[edges.vertices[:, 0]]
-        centres = np.where(np.isfinite(ends), ends, 0).mean(1)
+        ends = np.where(np.isfinite(ends), ends, 0)
+        centres = ends[:, 0] + edges.part[:, 0].mean(1, keepdims=True) * (ends[:, 1] - ends[:, 0])
         # Opaque, like the offsets below: scenes that differ in numbers only share their kernels.
         self.centre = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in np.median(centres, axis=0)))
         slots, self.depths, leaf_size = [], [], 0

@@ -208,7 +208,8 @@ class Silhouettes:
         if self.tree is None or not self.tree.device_edges.any_farther:
             return aside
         active = sample.edge < self.count
-        farther = self.tree.device_edges.farther(scene, placement.positions, dr.select(active, sample.edge, 0), p)
+        edge = dr.select(active, sample.edge, 0)
+        farther = self.tree.device_edges.farther(scene, placement.positions, edge, p, x - p)
         return aside + dr.select(active, farther, 0)
 
     def point(

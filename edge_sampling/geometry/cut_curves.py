@@ -287,6 +287,11 @@ class CutCurves:
         normals, distances = zip(*((dr.detach(n), g - dr.detach(g)) for g, n in surfaces), strict=True)
         return stay_on(p, normals, distances, mi.Bool(True)), mi.Vector3f(tangent)
 
+    def normals(self, positions: mi.Float, piece: mi.UInt32, p: mi.Point3f) -> list[mi.Vector3f]:
+        """Of both surfaces at points p of pieces; detached."""
+        surfaces = self._pairs.take(piece).surfaces(dr.detach(positions))
+        return [mi.Vector3f(s.distance(mi.Vector3d(p))[1]) for s in surfaces]
+
     def is_met(
         self, positions: mi.Float, piece: mi.UInt32, p: mi.Point3f, d: mi.Vector3f, q: mi.Point3f, slack: mi.Float
     ) -> mi.Bool:

@@ -25,9 +25,9 @@ BEHIND = 8
 #: And beside those of meshes that rays go through as if nothing was there, in units of the offset of such rays.
 BESIDE_MASK = 2
 
-#: And beside lines in which meshes cut through each other: closer, rays start below the other surface where that
-#: overhangs.
-BESIDE_LINE = 2
+#: And beside lines in which shapes cut through each other, in the same units, where the other surface overhangs: the
+#: cotangent of the angle between both, beyond which rays start below it, but at most the second number.
+BESIDE_LINE = 1.25, 8
 
 #: Which meshes glass and masks are.
 KINDS = bends_light, lets_rays_through
@@ -40,9 +40,9 @@ class DeviceEdges:
     """
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
-    _OF_EDGES = ("_ends", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
-    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_through", "_first_line")
-    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", *_ANY, *_OF_EDGES))
+    _OF_EDGES = ("_ends", "_part", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
+    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_joined", "_any_through", "_first_line")
+    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", "_lines", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
         # Copied, since Dr.Jit maps NumPy's memory: two arrays on the same memory make `dr.freeze` record anew.
@@ -60,17 +60,22 @@ class DeviceEdges:
         glass, mask = (np.array([is_so(m) for m in geometry.meshes] or [False])[edges.mesh].any(1) for is_so in KINDS)
         self._glass, self._mask = mi.Bool(glass & ~edges.is_line), mi.Bool(mask & ~edges.is_line)
         #: Is there an edge beside which `farther` is not 0?
-        self.any_farther = bool((glass | mask | edges.is_line).any())
+        self.any_farther = bool((glass | mask | edges.is_line | edges.joined).any())
         #: Are there lines in which shapes cut through each other?
         self._any_lines = bool(edges.is_line.any())
+        self._lines = geometry.lines if self._any_lines else ()
         #: The curves among them, which come first.
-        curves = [lines for lines in geometry.lines if not lines.straight] if self._any_lines else []
-        self.curves = curves[0] if curves else None
+        self.curves = self._lines[0] if self._lines and not self._lines[0].straight else None
         self._first_line = int(np.argmax(edges.is_line)) if self._any_lines else 0
         shapes = (*geometry.meshes, *geometry.analytic, *geometry.others)
         #: Is there a surface that lets rays through?
         self._any_through = any(lets_rays_through(s) for s in shapes)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
+        #: Are there edges made of sides that lie on one another (`close_cracks`), and of which parts of these?
+        self._any_joined = bool(edges.joined.any())
+        number = lambda a: mi.Float(np.array(a))
+        ends = [[number(edges.part[:, side, k]) for k in (0, 1)] for side in (0, 1)]
+        self._part = ends if self._any_joined else None
 
     def end_points(self, positions: mi.Float, edge: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
         """End points of edges, world space; of split vertices the mean, so that all copies have a gradient."""
@@ -81,7 +86,18 @@ class DeviceEdges:
         return a, b
 
     def _points_of_side(self, positions, edge, side):
-        return (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, self._ends[side][k], edge)) for k in (0, 1))
+        a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, self._ends[side][k], edge)) for k in (0, 1))
+        if not self._any_joined:
+            return a, b
+        s, t = (dr.gather(mi.Float, part, edge) for part in self._part[side])
+        return dr.select(s == 0, a, dr.lerp(a, b, s)), dr.select(t == 1, b, dr.lerp(a, b, t))
+
+    def _crack(self, positions: mi.Float, edge: mi.UInt32) -> mi.Float | float:
+        """How far apart the two sides of an edge are at most: scene units. Known where some were joined."""
+        if not self._any_joined:
+            return 0.0
+        sides = [self._points_of_side(positions, edge, side) for side in (0, 1)]
+        return dr.maximum(*(dr.norm(p - q) for p, q in zip(*sides, strict=True)))
 
     def on_curve(self, positions: mi.Float, edge: mi.UInt32, t: mi.Float) -> tuple[mi.Bool, mi.Point3f, mi.Vector3f]:
         """Which edges are pieces of curves; their points t, world space, attached, and the derivatives with respect to
@@ -91,8 +107,13 @@ class DeviceEdges:
 
     def _piece(self, edge: mi.UInt32) -> tuple[mi.Bool, mi.UInt32]:
         """Which edges are pieces of curves, and which ones."""
-        curved = (edge >= self._first_line) & (edge < self._first_line + self.curves.capacity)
-        return curved, dr.select(curved, edge - self._first_line, 0)
+        return self._number(edge, self._first_line, self.curves.capacity)
+
+    @staticmethod
+    def _number(edge: mi.UInt32, first: int, count: int) -> tuple[mi.Bool, mi.UInt32]:
+        """Which edges are among `count` of them from `first` on, and where there."""
+        among = (edge >= first) & (edge < first + count)
+        return among, dr.select(among, edge - first, 0)
 
     def normals(self, positions: mi.Float, edge: mi.UInt32) -> list[mi.Vector3f]:
         """Normals of the faces on both sides, not normalised.
@@ -130,10 +151,10 @@ class DeviceEdges:
         """
         a, b = self.end_points(positions, edge)
         normals = [dr.normalize(dr.cross(b - a, o - a)) for o in self.opposite(positions, edge)]
-        covers, shown = [], []
+        covers, shown, crack = [], [], self._crack(positions, edge)
         for ray, si in zip(rays, met, strict=True):
             through = self._lets_through(si)
-            slack = rounding(p, ray.o)
+            slack = rounding(p, ray.o) + crack
             passed = [passes(ray, p, [a, b, o]) for o in self.opposite(positions, edge)]
             there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
             covers.append(passed[0] & passed[1])
@@ -208,7 +229,9 @@ class DeviceEdges:
         sine = dr.norm(dr.cross(first, second))
         return dr.select(dr.gather(mi.Bool, self._two_faces, edge) & (sine > COPLANAR), dr.square(sine), 0)
 
-    def farther(self, scene: mi.Scene, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f) -> mi.Float:
+    def farther(
+        self, scene: mi.Scene, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f
+    ) -> mi.Float:
         """How much farther beside a point p of edges to look than rounding asks for: scene units. Detached.
 
         Rays start that far below the first face of glass, and so above the second, if they are closer to the edge than
@@ -218,8 +241,25 @@ class DeviceEdges:
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         cotangent = dr.dot(first, second) / dr.norm(dr.cross(first, second))
         wedge = dr.select(of(self._glass) & of(self._two_faces), dr.clip(cotangent, 0, 1), 0)
-        farther = dr.select(of(self._is_line), BESIDE_LINE, BEHIND * wedge) * lift(scene, p)
+        if self._any_lines:
+            wedge = dr.select(of(self._is_line), self._overhang(positions, edge, p, to_viewer), BEHIND * wedge)
+        else:
+            wedge *= BEHIND
+        farther = wedge * lift(scene, p) + self._crack(positions, edge)
         return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
+
+    def _overhang(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:
+        """How far beside a line in which surfaces cut each other rays start below the other one, in units of the offset
+        of rays: see `BESIDE_LINE`."""
+        normals, start = [mi.Vector3f(0), mi.Vector3f(0)], self._first_line
+        for lines in self._lines:
+            here, line = self._number(edge, start, lines.capacity)
+            normals = [dr.select(here, m, n) for m, n in zip(lines.normals(positions, line, p), normals, strict=True)]
+            start += lines.capacity
+        first, second = (dr.mulsign(n, dr.dot(n, to_viewer)) for n in normals)
+        cotangent = -dr.dot(first, second) / dr.norm(dr.cross(first, second))
+        margin, most = BESIDE_LINE
+        return dr.clip(margin * cotangent, 0, most)
 
     def is_smooth(self, edge: mi.UInt32) -> mi.Bool:
         """Are interpolated normals, and all else, the same on both sides?"""

@@ -32,6 +32,10 @@ class EdgeKind(IntEnum):
     SMOOTH = 3
 
 
+#: The part of a side that an edge has: all of it.
+WHOLE = np.array([0, 1], np.float32)
+
+
 @dataclass(frozen=True)
 class Edges:
     """Topology of the edges of all meshes of a scene, on the host. Positions change, and are not stored.
@@ -47,6 +51,9 @@ class Edges:
     count    : (E,), uint32; number of faces.
     is_line  : (E,), bool; is it a line in which shapes cut through each other (`Intersections`, `CutCurves`)? Its
                vertices are not those of a mesh, its mesh is not told, and its faces do not end there.
+    part     : (E, 2, 2), float32; `[e, side]` = from where to where between these two end points the edge extends:
+               0 and 1, unless the side was divided.
+    joined   : (E,), bool; is it made of sides that lie on one another, or of a part of one (`close_cracks`)?
 
     The end points of the first side are in the order in which its face runs through them.
     """
@@ -57,6 +64,8 @@ class Edges:
     kind: np.ndarray
     count: np.ndarray
     is_line: np.ndarray
+    part: np.ndarray
+    joined: np.ndarray
 
     @property
     def open(self) -> np.ndarray:
@@ -69,6 +78,9 @@ class Edges:
     def take(self, which: np.ndarray) -> Edges:
         """Some of the edges, by index or by mask."""
         return Edges(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def __add__(self, other: Edges) -> Edges:
+        return Edges(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
     def of_meshes(self, wanted: np.ndarray, *, lines: bool = False) -> Edges:
         """The edges that have a face in one of the meshes for which `wanted` (bool) holds. lines : and all lines?"""
@@ -160,6 +172,8 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
         kind=kind,
         count=count.astype(np.uint32),
         is_line=np.zeros(len(face0), bool),
+        part=np.broadcast_to(WHOLE, (len(face0), 2, 2)),
+        joined=np.zeros(len(face0), bool),
     )
     return edges, Weld(weld, tolerance)
 
@@ -167,7 +181,8 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
 def _no_edges() -> Edges:
     none = np.zeros((0, 2), np.uint32)
     flat = lambda kind: np.zeros(0, kind)
-    return Edges(np.zeros((0, 2, 2), np.uint32), none, none, flat(np.uint8), flat(np.uint32), flat(bool))
+    part = np.zeros((0, 2, 2), np.float32)
+    return Edges(part.astype(np.uint32), none, none, flat(np.uint8), flat(np.uint32), flat(bool), part, flat(bool))
 
 
 def _weld_equal(point: np.ndarray) -> np.ndarray:

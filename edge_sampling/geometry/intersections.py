@@ -14,14 +14,14 @@ either side is *not* fixed to the line, as it is to an edge: both surfaces slide
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .device_edges import rounding
-from .edges import EdgeKind, Edges, Weld
+from .edges import WHOLE, EdgeKind, Edges, Weld
 from .meshes import Geometry, number_of, positions_of
 from .rigid_motion import Shapes
 
@@ -254,6 +254,11 @@ class Intersections:
             sides = [mi.Point3f(lower + dr.select(cut, s * aside, 0)) for s in (1, -1)]
         return [*(_follow(p, first, second, cut) for p in (lower, upper)), *sides]
 
+    def normals(self, positions: mi.Float, line: mi.UInt32, p: mi.Point3f) -> list[mi.Vector3f]:
+        """Of both triangles; detached. p : not needed."""
+        corners = [dr.gather(mi.Point3f, dr.detach(positions), dr.gather(mi.UInt32, c, line)) for c in self.corners]
+        return [_normal(corners[:3]), _normal(corners[3:])]
+
     def as_edges(self, edges: Edges, vertices: int) -> Edges:
         """`edges`, and after them these lines, as edges that are boundaries from everywhere.
 
@@ -277,9 +282,10 @@ def line_edges(edges: Edges, n: int, vertices: int) -> Edges:
         kind=np.full(n, EdgeKind.JUMP, np.uint8),
         count=np.full(n, 4, np.uint32),
         is_line=np.ones(n, bool),
+        part=np.broadcast_to(WHOLE, (n, 2, 2)),
+        joined=np.zeros(n, bool),
     )
-    both = lambda name: np.concatenate([getattr(edges, name), getattr(lines, name)])
-    return Edges(*(both(f.name) for f in fields(Edges)))
+    return edges + lines
 
 
 def _each_once(found: list[mi.UInt32]) -> list[mi.UInt32]:

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from .beams import BEAMS, border_values, has_hard_beam
+from .cracks import Cracks
 from .edges import Edges, Weld
 from .meshes import (
     Geometry,
@@ -53,10 +54,18 @@ class Sources:
     ----------
     scene, found : the scene and its parameters.
     geometry : its shapes.
-    edges, weld : of the meshes.
+    edges, weld, cracks : of the meshes.
     """
 
-    def __init__(self, scene: mi.Scene, found: list[Parameter], geometry: Geometry, edges: Edges, weld: Weld) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        found: list[Parameter],
+        geometry: Geometry,
+        edges: Edges,
+        weld: Weld,
+        cracks: Cracks,
+    ) -> None:
         self._objects, self._numbers = _objects(scene, found, geometry)
         #: Mesh → its pairs of vertices at the two sides of edges.
         self._seams = _seams(geometry, edges)
@@ -87,6 +96,13 @@ class Sources:
             tolerance = np.where(distance > 0, HYSTERESIS * np.maximum(distance, weld.tolerance), 0)
             #: How far apart each pair may be, whatever the rounding error: scene units.
             self._tolerance = mi.Float(tolerance.astype(np.float32))
+
+        #: Vertices that lie on edges: these, the end points, where between them, and how far apart.
+        self._on_edges: tuple | None = None
+        if len(cracks):
+            ends = [_index(cracks.ends[:, k]) for k in (0, 1)]
+            at, tolerance = (mi.Float(x.astype(np.float32)) for x in (cracks.at, HYSTERESIS * cracks.tolerance))
+            self._on_edges = _index(cracks.vertex), ends, at, tolerance
 
     def same_objects(self, scene: mi.Scene, found: list[Parameter], geometry: Geometry) -> bool:
         """Are there the same shapes, of the same size, with the same materials and lights? Asks the host alone."""
@@ -161,14 +177,23 @@ class Sources:
         return differ
 
     def _parted_or_met(self, positions: mi.Float) -> list[mi.Bool]:
-        """Which vertices have left the place they had in common, and which have come to the place of others?"""
+        """Which vertices have left the place they had in common, or on an edge, and which have come to the place of
+        others?"""
         changes = []
         if self._pairs is not None:
             p, q = (dr.gather(mi.Point3f, positions, i) for i in self._pairs)
-            rounding = dr.epsilon(mi.Float) * dr.max(dr.maximum(dr.abs(p), dr.abs(q)))
-            changes.append(dr.norm(p - q) > dr.maximum(APART * rounding, self._tolerance))
+            changes.append(_are_apart(p, q, self._tolerance))
+        if self._on_edges is not None:
+            vertex, ends, at, tolerance = self._on_edges
+            a, b = (dr.gather(mi.Point3f, positions, i) for i in ends)
+            changes.append(_are_apart(dr.gather(mi.Point3f, positions, vertex), dr.lerp(a, b, at), tolerance))
         changes.append(_coincide(positions, self._first))
         return changes
+
+
+def _are_apart(p: mi.Point3f, q: mi.Point3f, tolerance: mi.Float) -> mi.Bool:
+    rounding = dr.epsilon(mi.Float) * dr.max(dr.maximum(dr.abs(p), dr.abs(q)))
+    return dr.norm(p - q) > dr.maximum(APART * rounding, tolerance)
 
 
 def _coincide(positions: mi.Float, vertices: mi.UInt32) -> mi.Bool:
@@ -206,7 +231,7 @@ def _seams(geometry: Geometry, edges: Edges) -> dict[int, tuple[mi.UInt32, mi.UI
     offsets = np.cumsum([0, *(m.vertex_count() for m in geometry.meshes)])
     pairs = edges.vertices.transpose(0, 2, 1).reshape(-1, 2)
     mesh, inside = np.repeat(edges.mesh[:, 0], 2), np.repeat(edges.mesh[:, 0] == edges.mesh[:, 1], 2)
-    split = inside & (pairs[:, 0] != pairs[:, 1])
+    split = inside & (pairs[:, 0] != pairs[:, 1]) & np.repeat(~edges.joined, 2)
     seams = {}
     for i in np.unique(mesh[split]).tolist():
         a, b = np.unique(pairs[split & (mesh == i)], axis=0).T - offsets[i]

@@ -19,6 +19,9 @@ from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
 from .mapped_horizons import mapped_horizons
 from .meshes import Geometry, has_place, has_texcoords, is_met, objects_below, pointer, texture_coordinates
 
+#: The texture that shows a volume on a surface.
+VOLUME = "VolumeAdapter"
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -167,12 +170,13 @@ def _matrices(shape: Any) -> list[np.ndarray]:
 
 
 def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
-    """Names of what jumps inside of faces: checkerboards, bitmaps with the `nearest` filter, and bump maps (where a
-    bitmap is continuous, its slope jumps at every texel).
+    """Names of what jumps inside of faces: checkerboards, bitmaps with the `nearest` filter, bump maps (where a bitmap
+    is continuous, its slope jumps at every texel), and volumes that jump between their voxels.
 
-    besides : shapes whose textures are not asked for.
+    besides : shapes whose textures are not asked for, but for volumes, whose jumps are not known as lines.
     """
-    known = [o for s in besides for o in objects_below(s).values()]
+    known = [o for s in besides for o in objects_below(s).values() if o.class_name() != VOLUME]
+    box = scene.bbox()
     uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if has_texcoords(m)]
     uv = np.concatenate([[[0, 0], [1, 1]], *uv])
     return [
@@ -182,6 +186,7 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
         and (
             (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
             or (has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))
+            or (o.class_name() == VOLUME and box.valid() and _jumps(o, list(box.min), list(box.max)))
         )
     ]
 
@@ -206,21 +211,23 @@ def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 25
     """Bisect segments towards their steeper half: where a texture is continuous, the difference dies out. They are
     random, and that between the brightest texel and the darkest, since few may differ from all others.
 
-    lower, upper : of the texture coordinates.
+    lower, upper : of the texture coordinates; of volumes, which vary in space, of the scene.
     """
-    ends = np.random.default_rng(0).uniform(lower, upper, (pairs, 2, 2))
-    ends = np.concatenate([ends, _brightest_and_darkest(texture)]).astype(np.float32)
+    in_space = len(lower) == 3
+    ends = np.random.default_rng(0).uniform(lower, upper, (pairs, 2, len(lower)))
+    ends = ends if in_space else np.concatenate([ends, _brightest_and_darkest(texture)])
+    ends = ends.astype(np.float32)
     with dr.suspend_grad():
         si = dr.zeros(mi.SurfaceInteraction3f, len(ends))
         if mi.is_spectral:
             si.wavelengths = type(si.wavelengths)(550)
 
-        def value(uv: mi.Point2f) -> mi.Spectrum:
-            si.uv = uv
+        def value(at: mi.Point2f | mi.Point3f) -> mi.Spectrum:
+            setattr(si, "p" if in_space else "uv", at)
             return texture.eval(si)
 
         difference = lambda f, g: dr.max(dr.abs(f - g))
-        p, q = (mi.Point2f(ends[:, k].T) for k in (0, 1))
+        p, q = ((mi.Point3f if in_space else mi.Point2f)(ends[:, k].T) for k in (0, 1))
         at_p, at_q = value(p), value(q)
         before = difference(at_p, at_q)
         for _ in range(steps):

@@ -49,7 +49,7 @@ class ChannelSearch(BoundarySearch):
             which = {"soft": "geo_normal" in self.kinds, "seams": "uv" in self.kinds}
             film = FilmBoundary(self.geometry, self._jumping(self._edges_and_lines), on_film, NoLights(), **which)
             film = film if any(film.outlines.counts) else None
-        limits = (*outlines(scene, self.geometry, self.edges, moving), *self._lasting_limits(scene))
+        limits = (*outlines(scene, self.geometry, self._cracks, moving), *self._lasting_limits(scene))
         return Boundaries(film, None, None, None, None, moving.flags, moving.camera, moving.lights, limits)
 
     def _jumping(self, edges: Edges) -> Edges:

@@ -11,12 +11,11 @@ import numpy as np
 
 from rimlight._plan import names
 from rimlight.edge_sampling import (
-    Edges,
+    Cracks,
     Geometry,
     film_parts,
     jumping_textures,
     objects_below,
-    t_junctions,
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
@@ -78,7 +77,7 @@ class Moving:
 def lasting_limits(
     scene: mi.Scene,
     geometry: Geometry,
-    edges: Edges,
+    cracks: Cracks,
     depths: Depths,
     moving: Moving,
     sppi: int,
@@ -94,7 +93,11 @@ def lasting_limits(
         if depths.scatters(1):
             limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
-    return (*limits, *appearance(scene, depths, moving, bisects=from_points), *outlines(scene, geometry, edges, moving))
+    return (
+        *limits,
+        *appearance(scene, depths, moving, bisects=from_points),
+        *outlines(scene, geometry, cracks, moving),
+    )
 
 
 def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool) -> list[str]:
@@ -170,8 +173,8 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
     return limits
 
 
-def outlines(scene: mi.Scene, geometry: Geometry, edges: Edges, moving: Moving) -> list[str]:
-    """What lacks, or is counted twice, at the outlines of shapes."""
+def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving) -> list[str]:
+    """What lacks at the outlines of shapes."""
     limits = []
     grids = names(s for s in scene.shapes() if s.class_name() == "SDFGrid")
     if grids:
@@ -187,17 +190,16 @@ def outlines(scene: mi.Scene, geometry: Geometry, edges: Edges, moving: Moving) 
             "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
             f"such nor meshes: {pairs}. Replace them by meshes."
         )
-    # Of edges that lie on one another, those of what stands still have no velocity, and do not count.
-    twice = sorted(
-        (geometry.meshes[i].id(), geometry.meshes[j].id())
-        for i, j in (t_junctions(geometry, edges) if moving.on_film else ())
-        if moving.camera or (moving.flags[i] and moving.flags[j])
-    )
-    if twice:
-        pairs = ", ".join(f'"{a}"' if a == b else f'"{a}" and "{b}"' for a, b in twice)
+    closed = {
+        tuple(geometry.meshes[i].id() for i in pair): width
+        for pair, width in cracks.widest().items()
+        if moving.camera or any(moving.flags[i] for i in pair)
+    }
+    if closed:
+        pairs = ", ".join(f'"{a}"' if a == b else f'"{a}" and "{b}"' for a, b in sorted(closed))
         limits.append(
-            "the derivative counts the jump at T-junctions twice, where a vertex lies inside of an open edge: "
-            f"{pairs}. Divide the longer edges there."
+            f"the derivative takes cracks between open edges for closed, which are up to {max(closed.values()):.1g} "
+            f"units wide: {pairs}. Join the vertices there, or move them farther apart."
         )
     return limits
 
@@ -259,6 +261,20 @@ class Media:
                         f'{who}: "{name}.{key}" ({medium.class_name()}) carries a gradient, but participating media '
                         "are not supported. Detach it, or use Mitsuba's prbvolpath."
                     )
+
+
+def refuse_timed_sky(scene: mi.Scene, who: str) -> None:
+    """Refuse a light that Mitsuba 3.9 cannot sample in symbolic loops, before these raise an error that names nothing.
+
+    Raises
+    ------
+    RuntimeError : there is such a light.
+    """
+    timed = names(e for e in scene.emitters() if e.class_name() == "TimedSunskyEmitter")
+    if timed and dr.flag(dr.JitFlag.SymbolicLoops):
+        raise Refusal(
+            f"{who}: Mitsuba cannot sample {', '.join(timed)} (timed_sunsky) in symbolic loops. Replace it by sunsky."
+        )
 
 
 def coarse_lamps(scene: mi.Scene) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from rimlight._collection import collect_before
 from rimlight._plan import names
 from rimlight.edge_sampling import (
+    Cracks,
     CutCurves,
     DeepShadows,
     Edges,
@@ -26,6 +27,7 @@ from rimlight.edge_sampling import (
     Silhouettes,
     Sources,
     TextureLines,
+    close_cracks,
     find_welded_edges,
     objects_below,
 )
@@ -41,7 +43,7 @@ from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
-from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits
+from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits, refuse_timed_sky
 
 #: Parameters of a light that move the shadows in it, or the border of its beam.
 PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction", "cutoff_angle")
@@ -68,6 +70,7 @@ class BoundarySearch:
         self.from_points, self.from_surfaces = from_points, from_surfaces
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
+        self._cracks = Cracks.none()
         self._instances = Instances()
         self._curves: CutCurves | None = None
         self._lines: Intersections | None = None
@@ -127,6 +130,7 @@ class BoundarySearch:
         if same:
             return
         self._refuse_while_recording()
+        refuse_timed_sky(scene, self.who)
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
         self.geometry = self.edges = self._curves = self._lines = self._sources = self._partial = self._media = None
         self._boundaries, self._beyond, self._maps, self._bent = {}, {}, [], []
@@ -135,7 +139,8 @@ class BoundarySearch:
         self.edges, weld = find_welded_edges(geometry)
         self._curves = CutCurves(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
-        self._sources = Sources(scene, found, geometry, self.edges, weld)
+        self.edges, self._cracks = close_cracks(geometry, self.edges, weld)
+        self._sources = Sources(scene, found, geometry, self.edges, weld, self._cracks)
         self._partial, self._media = PartialParameters(scene), Media(scene)
         self._maps = [m for s in surfaces(scene) for m in mapped_horizons(s)]
         self._bent = [(s, o) for s in surfaces(scene) for o in objects_below(s).values() if hasattr(o, "turns")]
@@ -212,7 +217,7 @@ class BoundarySearch:
         deep = None
         if shading is not None and self.from_surfaces and self.depths.scatters(3):
             deep = DeepShadows(scene, shading.silhouettes)
-        limits = lasting_limits(scene, self.geometry, self.edges, self.depths, moving, sppi, **abilities)
+        limits = lasting_limits(scene, self.geometry, self._cracks, self.depths, moving, sppi, **abilities)
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights

@@ -45,7 +45,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     **Limits.** Only triangle meshes and their instances, spheres, disks and cylinders can move: moving hair is refused,
     and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and
     cylinders cut through such shapes, cuts of the far clipping plane through any, and shadows of hair, ... on
-    what moves. Warned about, too: jumps at T-junctions, which count twice, and participating
+    what moves. Warned about, too: participating
     media, which are taken for empty (derivatives with respect to their parameters are refused). So is the light of
     smooth-shaded lamps with coarse meshes, which is off by some per cent. Polarised variants are refused. With
     filters other than ``box``, the ratio of sums that makes a pixel has a bias of order 1/spp, as it has in the

@@ -17,7 +17,7 @@ import mitsuba as mi
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart
 from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
-from rimlight.edge_sampling.geometry.device_edges import BEHIND, BESIDE_LINE
+from rimlight.edge_sampling.geometry.device_edges import BEHIND
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
@@ -43,6 +43,9 @@ HIDDEN, HALVINGS = 4, 7
 
 #: Where nothing is found to jump in it after all, it is looked at once more, so many times as long.
 WIDE = 16
+
+#: How far beside lines in which surfaces cut each other to look, in units of the offset of rays that start there.
+BESIDE_CUT = 2
 
 #: How far beside lines of textures to look, in units in the last place of the coordinates in which they are whole.
 BESIDE_TEXTURE = 64
@@ -199,7 +202,7 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
     aside = dr.zeros(mi.Float, dr.width(at.found))
     if outline is not None:
         touch, along, _ = outline
-        lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, dr.select(touch.cut, BESIDE_LINE, 0))
+        lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, dr.select(touch.cut, BESIDE_CUT, 0))
         aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
         aside = dr.select(~at.on_texture & ~at.grazes, aside, 0)
     if chains.textures is not None:

@@ -12,6 +12,7 @@ from building import CUBE_FACES, cube_vertices, diffuse, horizontal, mesh, quad,
 from random_scenes import ball, torus
 
 from rimlight.edge_sampling import Geometry, Intersections, find_welded_edges
+from rimlight.edge_sampling.geometry.device_edges import BESIDE_LINE, DeviceEdges
 from rimlight.edge_sampling.geometry.rigid_motion import Shapes
 
 
@@ -233,3 +234,21 @@ def test_lines_are_edges_after_all_others():
     assert dr.width(extended.positions()) == 3 * (8 + lines.vertices)
     assert len(extended.host_positions()) == 8 + lines.vertices == both.vertices.max() + 1 + 2 * lines.capacity
     assert dr.width(extended.normals()) == 3 * (8 + lines.vertices)
+
+
+@pytest.mark.parametrize(("angle", "expected"), [(0, np.sqrt(1 / 3)), (90, 0.0), (180, np.sqrt(1 / 3)), (270, 0.0)])
+def test_how_far_rays_beside_a_line_start_below_the_other_surface(angle, expected):
+    """Two sheets cut each other at 60°; the viewer stands between them, on one of four sides."""
+    axis = lambda degrees: np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0])
+    sheet = lambda name, d: quad(-d - [0, 0, 0.9], 2 * d, [0, 0, 2], name, bsdf=diffuse(0.5))
+    made = scene(first=sheet("first", axis(30)), second=sheet("second", axis(-30)))
+    lines, geometry = intersections(made)
+    geometry = replace(geometry, lines=(lines,))
+    edges, _ = find_welded_edges(geometry)
+    count = len(edges)
+    edges = lines.as_edges(edges, sum(m.vertex_count() for m in geometry.meshes))
+    device = DeviceEdges(edges, geometry)
+    edge = count + dr.arange(mi.UInt32, lines.count)
+    towards = mi.Vector3f(*map(float, 5 * axis(angle)))
+    found = device._overhang(geometry.positions(), edge, mi.Point3f(0), towards).numpy()
+    np.testing.assert_allclose(found, BESIDE_LINE[0] * expected, atol=1e-5)

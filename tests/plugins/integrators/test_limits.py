@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 from random_scenes import ball
 
-from rimlight.checks import Motion, derivative_image
-from rimlight.edge_sampling import Geometry, find_edges, t_junctions
-
 FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
 
 
@@ -35,93 +32,6 @@ def said(scene, *keys: str, kind: str = "direct_edge", derivative: bool = False,
     limits = integrator.plan(scene).limits
     assert [m.split(f"{kind}: ", 1)[1] for m in messages] == list(limits)
     return messages
-
-
-# ---------------------- T-junctions ----------------------
-
-
-def strip(name: str, *points, **more):
-    """Triangles beside each other."""
-    return cases.mesh(name, points, [[k, k + 1, k + 2] for k in range(len(points) - 2)], **more)
-
-
-def halves(gap: float = 0.0, turn: float = 0.0, aligned: bool = False):
-    """A sheet with one long edge, and another with two short ones at the same place."""
-    grey = lambda value: {"bsdf": cases.diffuse(value, two_sided=True)}
-    left = cases.mesh("left", [[0, -1, 0], [0, 1, 0], [-1, 0, 0]], [[0, 1, 2]], **grey(0.8))
-    x, z = gap + np.cos(turn), np.sin(turn)
-    p = [[gap, -1, 0], [gap, 0, 0], [gap, 1, 0], [x, 0, z]]
-    right = cases.mesh(
-        "right", p[::2] + p[3:] if aligned else p, [[0, 2, 1]] if aligned else [[0, 3, 1], [1, 3, 2]], **grey(0.2)
-    )
-    return cases.scene(sensor=cases.camera((0, 0, -5)), left=left, right=right, sky=cases.constant())
-
-
-JUNCTION = 'T-junctions twice, where a vertex lies inside of an open edge: "left" and "right"'
-SHAPES = ("left.vertex_positions", "right.vertex_positions")
-
-
-@pytest.mark.parametrize("derivative", [True, False])
-@pytest.mark.parametrize("keys", [SHAPES, ("sensor.to_world",)], ids=["shapes", "camera"])
-def test_t_junctions_are_warned_about(keys, derivative):
-    (message,) = said(halves(), *keys, derivative=derivative)
-    assert JUNCTION in message
-
-
-@pytest.mark.parametrize(
-    ("scene", "keys"),
-    [
-        (lambda: halves(gap=1e-3), SHAPES),  # beside each other
-        (lambda: halves(aligned=True), SHAPES),  # welded
-        (halves, SHAPES[:1]),  # the other one stands still, and has no velocity
-        (halves, ("left.bsdf.brdf_0.reflectance.value",)),
-    ],
-    ids=["gap", "welded", "one moves", "colour"],
-)
-def test_no_t_junction_that_matters(scene, keys):
-    assert not said(scene(), *keys)
-
-
-def test_t_junctions_count_twice():
-    """Were it not so, the warning would be wrong."""
-    total = lambda scene: np.abs(
-        np.mean(
-            [
-                derivative_image(
-                    scene,
-                    mi.load_dict({"type": "direct_edge", "sppc": 0}),
-                    Motion(scene, "sensor.to_world", direction=[1, 0, 0]),
-                    spp=64,
-                    seed=seed,
-                )
-                for seed in range(4)
-            ],
-            axis=0,
-        )[12:20, 14:18]
-    ).sum()
-    assert total(halves()) == pytest.approx(2 * total(halves(aligned=True)), rel=0.05)
-
-
-def test_t_junctions_of_meshes():
-    """Turned about the common line; ends on it at an angle; within one mesh; and beyond its end."""
-    pairs = lambda *meshes: t_junctions(Geometry(tuple(meshes)), find_edges(Geometry(tuple(meshes))))
-    assert pairs(*[s for s in halves(turn=1.0).shapes() if s.is_mesh()]) == {(0, 1)}
-    long = strip("long", [0, 0, 0], [0, 2, 0], [-1, 1, 0])
-    assert pairs(long, strip("corner", [0, 1, 0], [1, 1, 0], [1, 2, 0])) == set()
-    assert pairs(long, strip("partly", [0, 1, 0], [0, 3, 0], [1, 2, 0])) == {(0, 1)}
-    assert pairs(long, strip("beyond", [0, 2.1, 0], [0, 3, 0], [1, 2, 0])) == set()
-    one = cases.mesh("one", [[0, 0, 0], [0, 2, 0], [-1, 1, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [0, 3, 4], [3, 1, 4]])
-    assert pairs(one) == {(0, 0)}
-    assert pairs(long) == set() and pairs() == set()
-
-
-def test_t_junctions_of_many_open_edges_are_found_in_seconds():
-    """A soup of 100,000 triangles: 300,000 open edges."""
-    rng = np.random.default_rng(0)
-    p = rng.uniform(-1, 1, (100_000, 1, 3)) + rng.uniform(-0.01, 0.01, (100_000, 3, 3))
-    geometry = Geometry((cases.mesh("soup", p.reshape(-1, 3), np.arange(300_000).reshape(-1, 3)),))
-    edges = find_edges(geometry)
-    assert len(edges) == 300_000 and t_junctions(geometry, edges) == set()
 
 
 # ---------------------- The far clipping plane ----------------------

@@ -172,6 +172,14 @@ def signed_distances() -> dict:
     return {"type": "sdfgrid", "normals": "smooth", "grid": mi.TensorXf(d[..., None].astype(np.float32))}
 
 
+def volume(filter_type: str) -> dict:
+    """Colours in space."""
+    grid = mi.VolumeGrid(np.random.default_rng(0).uniform(0.1, 0.9, (4, 4, 4, 3)).astype(np.float32))
+    box = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2.2)
+    of = {"type": "gridvolume", "grid": grid, "raw": True, "filter_type": filter_type, "to_world": box}
+    return textured({"type": "volume", "volume": of})
+
+
 def at(place, size: float = 0.35):
     return mi.ScalarTransform4f().translate(list(place)).rotate([0.3, 1, 0], 25).scale(size)
 
@@ -266,6 +274,7 @@ CELLS = {
 }
 ANALYTIC = ("`sphere`", "`disk`", "`cylinder`")
 PIXELS = 8
+VOXELS = "thing.bsdf.brdf_0.reflectance.volume.data"
 
 
 def names(first: str) -> list[str]:
@@ -421,6 +430,7 @@ def lamp(kind: str, channel: int) -> dict:
             "sun_direction": [0.3, 0.3, 1],
             "to_world": T().rotate([1, 0, 0], -90),
         },
+        "timed": lambda: {"type": "timed_sunsky"},
         "sunsky": lambda: {
             "type": "sunsky",
             "sun_scale": 0.2,
@@ -625,6 +635,34 @@ def test_thin_glass_changes():
     assert_exact("thin_glass", stage({"thing": glass, "lamp": back}), "thing.bsdf.eta", 0.02, 512, direction=[1])
 
 
+@pytest.mark.parametrize("column", ["moves", "changes", "passed"])
+def test_colours_in_space(column):
+    key = {"moves": "thing.vertex_positions", "changes": VOXELS, "passed": "plate.vertex_positions"}[column]
+    scene = stage({"thing": sheet("thing", np.array([0.2, -0.4, -0.3]), volume("trilinear")), "lamp": lamp("area", 0)})
+    motion = {"direction": [1]} if column == "changes" else SIDEWAYS
+    assert_exact(f"volume_{column}", scene, key, 0.02 if column == "changes" else 5e-3, 128, **motion)
+
+
+def test_voxels_that_jump_change():
+    scene = stage({"thing": sheet("thing", np.array([0.2, -0.4, -0.3]), volume("nearest")), "lamp": lamp("area", 0)})
+    assert_exact("voxels", scene, VOXELS, 0.02, 128, direction=[1])
+
+
+@pytest.mark.parametrize("key", ["eumelanin", "longitudinal_roughness"])
+def test_hair_changes(key):
+    hair = {"type": "hair", "eumelanin": 0.3, "pheomelanin": 0.2, "longitudinal_roughness": 0.5}
+    thing = sheet("thing", np.array([0.2, -0.4, -0.3]), hair)
+    scene = stage({"thing": thing, "lamp": lamp("area", 0)})
+    assert_exact(f"hair_{key}", scene, f"thing.bsdf.{key}", 0.02, 512, direction=[1])
+
+
+def test_nobody_sees_the_light_of_directionalarea():
+    shade = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90)}
+    scene = stage({"lamp": {**shade, "emitter": {"type": "directionalarea", "radiance": 5.0}}})
+    for integrator in ({"type": "path"}, {"type": "direct_edge"}, {"type": "prb_edge"}):
+        assert not np.array(mi.render(scene, integrator=mi.load_dict(integrator), spp=16)).any()
+
+
 @pytest.mark.parametrize(
     ("key", "step", "motion"),
     [
@@ -670,7 +708,11 @@ def log():
         yield found
 
 
-SILHOUETTES, SENSOR = REFUSALS = ("silhouettes cannot be sampled", "is not supported, use one of")
+SILHOUETTES, SENSOR, TIMED = REFUSALS = (
+    "silhouettes cannot be sampled",
+    "is not supported, use one of",
+    "in symbolic loops",
+)
 
 
 def enable(scene: mi.Scene, key: str) -> mi.SceneParameters:
@@ -759,7 +801,13 @@ MESSAGES = {
     ],
     "`irradiancemeter`": [second_sensor("irradiancemeter", "thing.to_world")],
     "`radiancemeter`, `distant`": [second_sensor("radiancemeter"), second_sensor("distant")],
+    ("`ellipsoids`, `ellipsoidsmesh`", "passed"): [
+        still(lambda: ellipsoids("ellipsoids"), "", "lacks the shadows and reflections of"),
+        still(lambda: ellipsoids("ellipsoidsmesh"), "", "lacks the shadows and reflections of"),
+    ],
     "`sunsky`": [in_lamp("sunsky", "border of the sun")],
+    "`timed_sunsky`": [in_lamp("timed", TIMED)],
+    "`volume` that shows a `gridvolume`, `nearest`": [material(lambda: volume("nearest"), "jumps of the textures")],
     "`mask` in `prb_edge`": [material(mask, THROUGH, deep=True)],
     "`null` in `prb_edge`": [material(bsdf("null"), THROUGH, deep=True)],
     "`polarizer`, `retarder`, `circular` in `prb_edge`": [material(bsdf(k), THROUGH, deep=True) for k in POLARISERS],
@@ -792,6 +840,9 @@ ELSEWHERE = {
     "`thindielectric`": [test_thin_glass_changes],
     "`glass`": ["glass_index"],  # otherwise as `dielectric`: see test_glass.py
     "`merl`": [test_measured_material],
+    "`hair`": [test_hair_changes],
+    "`volume` that shows a `gridvolume`, `trilinear`": [test_colours_in_space],
+    "`volume` that shows a `gridvolume`, `nearest`": [test_voxels_that_jump_change],
     "`ggx_dictionary`": [test_dictionary_of_lobes],
     "`area` on meshes": ["shadow_light", "room_light"],
     "`area` on `sphere`, `disk`, `cylinder`": ["sphere_light"],

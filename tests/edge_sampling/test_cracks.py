@@ -1,0 +1,84 @@
+"""Open edges that lie on one another are joined: T-junctions, and cracks that are narrower than a tolerance."""
+
+from __future__ import annotations
+
+import cases
+import cuts
+import numpy as np
+import pytest
+
+from rimlight.edge_sampling import EdgeKind, Geometry, close_cracks, find_welded_edges
+
+
+def joined(*meshes):
+    """The edges of meshes after and before, and where they were joined."""
+    geometry = Geometry(tuple(meshes))
+    edges, weld = find_welded_edges(geometry)
+    return *close_cracks(geometry, edges, weld), edges
+
+
+def strip(name: str, *points, **more):
+    """Triangles beside each other."""
+    return cases.mesh(name, points, [[k, k + 1, k + 2] for k in range(len(points) - 2)], **more)
+
+
+LONG = ([0, 0, 0], [0, 2, 0], [-1, 1, 0])
+
+
+def test_a_cube_of_faces_that_are_divided_differently_is_closed():
+    cube = next(s for s in cuts.patchwork().shapes() if s.id() == "cube")
+    edges, cracks, before = joined(cube)
+    assert before.open.sum() == 48 and not edges.open.any() and edges.joined.any()
+    assert (edges.kind == EdgeKind.FLAT).all() and not cracks.widest()
+    ends = Geometry((cube,)).host_positions()[edges.vertices.astype(int)]
+    a, b = ends[:, :, 0, None], ends[:, :, 1, None]
+    sides = a + edges.part[..., None] * (b - a)
+    np.testing.assert_allclose(sides[:, 0], sides[:, 1], atol=1e-6)
+    # Both faces of an edge are faces of the cube: at right angles, or in one plane.
+    along = sides[:, 0, 1] - sides[:, 0, 0]
+    away = Geometry((cube,)).host_positions()[edges.opposite.astype(int)] - sides[:, 0, :1]
+    normals = np.cross(along[:, None], away)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    cosine = -np.einsum("ij,ij->i", normals[:, 0], normals[:, 1])
+    assert ((np.abs(cosine) < 1e-5) | (np.abs(cosine - 1) < 1e-5)).all()
+
+
+def test_the_part_of_a_long_edge_on_which_nothing_lies_stays_open():
+    edges, cracks, _ = joined(strip("long", *LONG), strip("partly", [0, 1, 0], [0, 3, 0], [1, 2, 0]))
+    new = edges.take(edges.joined)
+    assert sorted(new.count) == [1, 1, 2] and len(cracks) == 2 and (new.kind == EdgeKind.JUMP).all()
+    parts = {tuple(p) for p in new.part[:, 0].tolist()}
+    assert parts == {(0.0, 0.5), (0.5, 1.0)}
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        strip,
+        lambda name: strip(name, [0, 1, 0], [1, 1, 0], [1, 2, 0]),  # a corner on it
+        lambda name: strip(name, [0, 2.1, 0], [0, 3, 0], [1, 2, 0]),  # beyond its end
+        lambda name: strip(name, [1e-3, 1, 0], [1e-3, 2, 0], [1, 2, 0]),  # beside it
+    ],
+    ids=["nothing", "corner", "beyond", "beside"],
+)
+def test_what_does_not_lie_on_one_another_stays_as_it_is(other):
+    name = "other"
+    others = () if other is strip else (other(name),)
+    edges, cracks, before = joined(strip("long", *LONG), *others)
+    assert len(cracks) == 0 and edges is before
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["inside", "at the ends"])
+def test_narrow_cracks_are_closed_and_known(inside):
+    ends = [[8e-6, 0, 0], [8e-6, 1, 0], [8e-6, 2, 0], [1, 1, 0]]
+    p, faces = (ends, [[0, 3, 1], [1, 3, 2]]) if inside else (ends[::2] + ends[3:], [[0, 2, 1]])
+    edges, cracks, _ = joined(strip("long", *LONG), cases.mesh("other", p, faces))
+    assert edges.open.sum() == 4 and cracks.widest() == {(0, 1): pytest.approx(8e-6)}
+
+
+def test_many_open_edges_take_seconds():
+    """A soup of 100,000 triangles: 300,000 open edges."""
+    rng = np.random.default_rng(0)
+    p = rng.uniform(-1, 1, (100_000, 1, 3)) + rng.uniform(-0.01, 0.01, (100_000, 3, 3))
+    edges, cracks, _ = joined(cases.mesh("soup", p.reshape(-1, 3), np.arange(300_000).reshape(-1, 3)))
+    assert len(edges) == 300_000 and len(cracks) == 0
