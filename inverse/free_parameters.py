@@ -241,7 +241,7 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
     found: list[Parameter] = []
     for entry in free:
         for key in entry.key:
-            _check_key(key, params)
+            check_key(key, params)
         moves_whole = lambda key, kind=entry.kind: (
             is_transform(params[key]) or (kind == "pose" and key.endswith("vertex_positions"))
         )
@@ -279,15 +279,16 @@ def _check_free_once(entry: Free, rigid: Iterable[str], found: Iterable[Paramete
             )
 
 
-def _check_key(key: str, params: Any) -> None:
+def check_key(key: str, params: Any, who: str = "fit") -> None:
+    """InputError : the scene has no such parameter, or it has no derivative. who : speaks in the message."""
     if key not in params:
         close = difflib.get_close_matches(key, list(params.keys()), n=3, cutoff=0.4)
         raise InputError(
-            f'fit: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
+            f'{who}: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
         )
     value = params[key]
     if not is_transform(value) and not (dr.is_diff_v(value) and dr.is_float_v(value)):
-        raise InputError(f'fit: "{key}" is of type {type(value).__name__}, which has no derivative')
+        raise InputError(f'{who}: "{key}" is of type {type(value).__name__}, which has no derivative')
 
 
 # ------------------------------------------------------------------ values of scenes
