@@ -28,6 +28,9 @@ RANGES = (
 )
 
 
+#: Displacements and angles of rigid bodies are smaller: beyond it, sines of single precision are not finite.
+FARTHEST = 1e9
+
 #: Values of no parameter.
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -58,6 +61,10 @@ class Parameter(ABC):
     def legal(self, name: str, latent: np.ndarray) -> np.ndarray:
         """The nearest legal latent."""
         return latent
+
+    def sound(self, latent: np.ndarray) -> bool:
+        """Can a scene be made of these numbers of a latent?"""
+        return bool(np.isfinite(latent).all())
 
     def mask(self, name: str) -> np.ndarray | None:
         """Which numbers of a latent are free. None: all."""
@@ -102,6 +109,9 @@ class RigidBody(Parameter):
             key: moved @ value if is_transform(value) else dr.ravel(moved @ dr.unravel(mi.Point3f, value))
             for key, value in ((key, so_far.get(key, initial)) for key, initial in self.initial.items())
         }
+
+    def sound(self, latent):
+        return bool((np.abs(latent) < FARTHEST).all())
 
     def rates(self):
         turn = self.free.rate / self.size if self.free.turn_rate is None else self.free.turn_rate

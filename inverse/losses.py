@@ -45,13 +45,14 @@ class LossFunction(Protocol):
         Parameters
         ----------
         image : (H, W, C), float32, linear radiance.
-        target : (H, W, C) or (H, W, 1), linear radiance.
-        weight : (H, W), how much each pixel counts, >= 0.
+        target : (H, W, C) or (H, W, 1), linear radiance; read-only.
+        weight : (H, W), how much each pixel counts, >= 0; read-only.
 
         Returns
         -------
         value : the loss.
-        gradient : (H, W, C), its derivative with respect to each number of the image.
+        gradient : (H, W, C), its derivative with respect to each number of the image. If one is not finite, the step is
+            skipped.
         metrics : label -> number, which the log and the report show.
         """
         ...

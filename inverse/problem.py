@@ -222,8 +222,8 @@ class Problem:
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
     threads: int | None = None
-    """Threads of this process. With 1, a fit that is repeated or resumed ends with the same numbers, bit by bit.
-    Default: one for each core."""
+    """Threads of this process, no more than it has cores. With 1, a fit that is repeated or resumed ends with the same
+    numbers, bit by bit. Default: one for each core."""
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
@@ -234,6 +234,8 @@ class Problem:
         for name in ("free", "stage", "target"):
             entries = getattr(self, name)
             put(name, tuple(entries) if isinstance(entries, tuple | list) else (entries,))
+        if any(t is None for t in self.target):  # what some programs return for a file that is not there
+            raise InputError("fit: a target is None; Target() is the unchanged scene file, rendered")
         targets = (t if isinstance(t, Target) else Target(file=t, sensor=i) for i, t in enumerate(self.target))
         put("target", tuple(targets))
         for name, kind in {"free": Free, "stage": Stage, "starts": Starts, "loss": Loss, "integrator": dict}.items():

@@ -396,11 +396,11 @@ def _thread(threads: int | None, share: int) -> ThreadPoolExecutor:
 
     global _renders
     if _renders is None:
-        count = threads or max(CPU_COUNT // share, 1)
+        count = min(threads or max(CPU_COUNT // share, 1), CPU_COUNT)
         dr.set_thread_count(count)
         _renders = ThreadPoolExecutor(1, thread_name_prefix="rimlight"), count
     pool, count = _renders
-    if threads not in (None, count):
+    if threads is not None and min(threads, CPU_COUNT) != count:
         raise Refusal(
             f"this worker has {count} threads since its first task, and the fit asks for {threads}; restart it"
         )

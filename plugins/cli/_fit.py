@@ -88,7 +88,7 @@ def _print(found: inverse.Result) -> None:
     )
     for name, views in of_views.items():
         for label in found.measures[0]:
-            before, after = np.mean([found.measures[i][label] for i in views], axis=0)
+            before, after = np.mean([m[label] for i in views if label in (m := found.measures[i])], axis=0)
             print(f"  {name}, {label}: {before:.4g} -> {after:.4g}")
         if found.floors:
             noise = np.mean([found.floors[i] for i in views])
