@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args, get_origin
 
 import cattrs
 import numpy as np
@@ -276,6 +276,7 @@ def _converter() -> cattrs.Converter:
     configure_union_passthrough(Value, converter)
     for kind, (told, allowed) in EXACT.items():
         converter.register_structure_hook(kind, _exactly(told, allowed))
+    converter.register_structure_hook_func(lambda kind: get_origin(kind) is Literal, _one_of)
     converter.register_structure_hook(Path, lambda value, _: Path(value))
     converter.register_unstructure_hook(Path, Path.as_posix)
     # "key" may be one name.
@@ -283,6 +284,12 @@ def _converter() -> cattrs.Converter:
     one_key = lambda d: {**d, "key": [d["key"]]} if isinstance(d.get("key"), str) else d
     converter.register_structure_hook(Free, lambda d, kind: structure_free(one_key(d), kind))
     return converter
+
+
+def _one_of(value: Any, kind: Any) -> Any:
+    if value not in get_args(kind):
+        raise InputError(f"fit: expected one of {', '.join(get_args(kind))}, got {value!r}")
+    return value
 
 
 def _exactly(told: str, allowed: tuple[type, ...]) -> Any:
@@ -307,7 +314,9 @@ def read(path: Path | str) -> Problem:
     """
     path = Path(path)
     try:
-        problem = from_text(path.read_text("utf-8"))
+        problem = from_text(path.read_text("utf-8-sig"))  # editors of Windows begin files with a mark
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: it is not UTF-8 (byte {error.start}); save it as that") from None
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     return relative_to(problem, path.parent)

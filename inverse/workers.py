@@ -106,6 +106,10 @@ class Workers:
             from distributed import Client, LocalCluster
         except ImportError:
             raise InputError("workers need the package distributed: pip install 'rimlight[cluster]'") from None
+        if cluster is None or isinstance(cluster, bool | float):
+            raise InputError(
+                f"a cluster is a number of processes, the address of a scheduler, or one of Dask, got {cluster!r}"
+            )
         if isinstance(cluster, int) and cluster < 1:
             raise InputError(f"the number of workers must be >= 1, got {cluster}")
         self.threads = threads
@@ -128,7 +132,7 @@ class Workers:
             else:
                 self.client = Client(cluster, timeout=CONNECT, set_as_default=False)
                 self._mine.insert(0, self.client)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, TypeError) as error:
             raise InputError(f'no cluster at "{cluster}": {error}') from None
         if self.client.scheduler is not None:
             self._address = self.client.scheduler.address

@@ -17,7 +17,7 @@ from rimlight import inverse
 from rimlight.inverse import Free, Problem
 from rimlight.loading import InputError, expected
 
-from ._loading import at_least, check_output, show_warnings
+from ._loading import at_least, check_output, one_cluster, show_warnings
 
 #: Of more views than so, their mean is printed; the report has all.
 FEW_VIEWS = 4
@@ -50,6 +50,7 @@ class Fit:
 
     def run(self) -> int:
         at_least(0, workers=self.workers)
+        one_cluster(self.workers, self.cluster)
         check_output(self.out, folder=True)
         if not self.resume and (self.out / "checkpoint.npz").exists():
             raise InputError(f'--out: "{self.out}" holds a fit already; add --resume, or name another folder')
@@ -146,6 +147,7 @@ class Reproduce:
 
         at_least(1, seeds=self.seeds)
         at_least(0, workers=self.workers)
+        one_cluster(self.workers, self.cluster)
         check_output(self.out, folder=True)
         show_warnings()
         with ExitStack() as stack, expected(OSError):

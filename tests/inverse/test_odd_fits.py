@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from rimlight import inverse
+from rimlight.cli import main
 from rimlight.inverse import Free, Problem, Stage, Target
+from rimlight.inverse import problem as problems
 
 pytestmark = pytest.mark.usefixtures("no_derivative_image")
 
@@ -211,7 +213,33 @@ def test_fits_of_nothing(options, culprit):
         inverse.Fit(posed(**options))
 
 
-# ------------------------------------------------------------------ folders
+# ------------------------------------------------------------------ files and folders
+
+TOML = 'scene = "s.xml"\n[[free]]\nkey = "a"\nkind = "{}"\n'
+
+
+def test_files_of_other_editors(tmp_path):
+    """Those of Windows begin files with a mark, and may not write UTF-8."""
+    file = tmp_path / "Größe 1.toml"
+    file.write_text(TOML.format("light").replace("\n", "\r\n"), "utf-8-sig")
+    assert problems.read(file).free[0].kind == "light"
+    file.write_text("# grün\n" + TOML.format("light"), "latin-1")
+    with pytest.raises(ValueError, match=r"Größe 1\.toml: it is not UTF-8 \(byte 4\); save it as that$"):
+        problems.read(file)
+
+
+def test_a_kind_that_is_none(tmp_path):
+    (tmp_path / "fit.toml").write_text(TOML.format("mat"), "utf-8")
+    with pytest.raises(ValueError, match=r"expected one of pose, material, light, shape, got 'mat' @ fit\.free"):
+        problems.read(tmp_path / "fit.toml")
+
+
+@pytest.mark.parametrize("command", ["fit joint fit.toml", "reproduce fig6a"])
+def test_workers_of_two_clusters(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fit.toml").write_text(TOML.format("light"), "utf-8")
+    assert main([*command.split(), "--out", "out", "--workers", "1", "--cluster", "tcp://127.0.0.1:1"]) == 2
+    assert "--cluster takes those of a cluster; give one of them" in capsys.readouterr().err
 
 
 def test_what_is_no_checkpoint(tmp_path):

@@ -151,7 +151,13 @@ def test_a_cluster_works_for_its_own_problem():
 
 
 @pytest.mark.parametrize(
-    ("cluster", "culprit"), [("nonsense://1", 'no cluster at "nonsense://1"'), (0, "workers must be >= 1, got 0")]
+    ("cluster", "culprit"),
+    [
+        ("nonsense://1", 'no cluster at "nonsense://1"'),
+        ([2], r'no cluster at "\[2\]"'),
+        (0, "workers must be >= 1, got 0"),
+        (None, "a cluster is a number of processes, the address of a scheduler, or one of Dask, got None"),
+    ],
 )
 def test_there_must_be_a_cluster(cluster, culprit):
     with pytest.raises(ValueError, match=culprit) as error:
