@@ -80,6 +80,14 @@ def of_kind(name: str, value: Any, kind: type) -> None:
             raise InputError(f"fit: {name} must be {wanted}, got {_short(one)}")
 
 
+def functions(name: str, given: Any) -> list[Callable[..., Any]]:
+    """One function, or several. InputError : one is none."""
+    found = [given] if callable(given) or not isinstance(given, Iterable) else list(given)
+    if wrong := [thing for thing in found if not callable(thing)]:
+        raise InputError(f"fit: {name} must be functions, got {_short(wrong[0])}")
+    return found
+
+
 def _name(settings: Any, field: str) -> str:
     kind = type(settings).__name__.lower()
     return field if kind == "problem" else f"{kind}.{field}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from rimlight.loading import InputError
 from . import batches, free_parameters, progress, sources
 from . import problem as problems
 from . import result as results
+from .conforming import functions
 from .executors import Executor, Here, executor_of
 from .free_parameters import to_numpy
 from .interruption import listening
@@ -98,8 +100,8 @@ class Fit:
             raise InputError(f"fit: give a problem or its fields, not both: {', '.join(fields)}")
         self.problem = Problem(**fields) if problem is None else problem
         self.file = None if out is None else Path(out) / "checkpoint.npz"
-        several = lambda given: [given] if callable(given) else list(given)
-        self.regularisers, self._callbacks = several(regularisers), several(on_step)
+        self.regularisers = functions("regularisers", regularisers)
+        self._callbacks = functions("on_step", on_step)
         self.status = "running"
         if tensorboard and self.file is None:
             raise InputError("fit: to write a log for TensorBoard, name a folder")
@@ -123,7 +125,7 @@ class Fit:
     def _prepare(self, executor: Executor | None) -> None:
         problem = self.problem
         if problem.threads is not None:
-            dr.set_thread_count(problem.threads)
+            dr.set_thread_count(min(problem.threads, os.cpu_count() or 1))  # more would only wait for each other
         self.renderer = Renderer(problem)
         self.executor = executor_of(problem, executor, self.renderer)
         self.fingerprints = sources.fingerprints(problem, self.renderer.scenes)
@@ -245,7 +247,8 @@ class Fit:
         if penalty is not None:
             loss += float(np.array(dr.detach(penalty)).item())
         scores = [found.scores[task.key] for task in tasks]
-        metrics = {label: float(np.mean([of_task[label] for of_task in scores])) for label in scores[0]}
+        labels = dict.fromkeys(label for of_task in scores for label in of_task)
+        metrics = {label: float(np.mean([s[label] for s in scores if label in s])) for label in labels}
         for text in found.doubts.values():
             now.doubts.append(text)
             log.warning("%s", text)

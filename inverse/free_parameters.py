@@ -28,6 +28,9 @@ RANGES = (
 )
 
 
+#: Displacements and angles of rigid bodies are smaller: beyond it, sines of single precision are not finite.
+FARTHEST = 1e9
+
 #: Values of no parameter.
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -58,6 +61,10 @@ class Parameter(ABC):
     def legal(self, name: str, latent: np.ndarray) -> np.ndarray:
         """The nearest legal latent."""
         return latent
+
+    def sound(self, latent: np.ndarray) -> bool:
+        """Can a scene be made of these numbers of a latent?"""
+        return bool(np.isfinite(latent).all())
 
     def mask(self, name: str) -> np.ndarray | None:
         """Which numbers of a latent are free. None: all."""
@@ -102,6 +109,9 @@ class RigidBody(Parameter):
             key: moved @ value if is_transform(value) else dr.ravel(moved @ dr.unravel(mi.Point3f, value))
             for key, value in ((key, so_far.get(key, initial)) for key, initial in self.initial.items())
         }
+
+    def sound(self, latent):
+        return bool((np.abs(latent) < FARTHEST).all())
 
     def rates(self):
         turn = self.free.rate / self.size if self.free.turn_rate is None else self.free.turn_rate
@@ -241,7 +251,7 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
     found: list[Parameter] = []
     for entry in free:
         for key in entry.key:
-            _check_key(key, params)
+            check_key(key, params)
         moves_whole = lambda key, kind=entry.kind: (
             is_transform(params[key]) or (kind == "pose" and key.endswith("vertex_positions"))
         )
@@ -279,15 +289,16 @@ def _check_free_once(entry: Free, rigid: Iterable[str], found: Iterable[Paramete
             )
 
 
-def _check_key(key: str, params: Any) -> None:
+def check_key(key: str, params: Any, who: str = "fit") -> None:
+    """InputError : the scene has no such parameter, or it has no derivative. who : speaks in the message."""
     if key not in params:
         close = difflib.get_close_matches(key, list(params.keys()), n=3, cutoff=0.4)
         raise InputError(
-            f'fit: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
+            f'{who}: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
         )
     value = params[key]
     if not is_transform(value) and not (dr.is_diff_v(value) and dr.is_float_v(value)):
-        raise InputError(f'fit: "{key}" is of type {type(value).__name__}, which has no derivative')
+        raise InputError(f'{who}: "{key}" is of type {type(value).__name__}, which has no derivative')
 
 
 # ------------------------------------------------------------------ values of scenes

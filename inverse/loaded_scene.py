@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import drjit as dr
@@ -29,8 +29,11 @@ class LoadedScene:
         """The values of parameters that this scene has."""
         return {key: value for key, value in values.items() if key in self.params}
 
-    def set(self, values: Mapping[str, np.ndarray]) -> dict[str, mi.Float]:
-        """Set parameters: key -> array as `to_numpy` makes it. Returns what collects the gradients: key -> flat."""
+    def set(self, values: Mapping[str, np.ndarray], wanted: Collection[str] | None = None) -> dict[str, mi.Float]:
+        """Set parameters: key -> array as `to_numpy` makes it. Returns what collects the gradients: key -> flat.
+
+        wanted : keys of parameters whose gradients are wanted. Default: all.
+        """
         leaves = {}
         for key, value in self.here(values).items():
             if key not in self._initial:
@@ -40,9 +43,10 @@ class LoadedScene:
             # Multiplied, so that it lies in Dr.Jit's own memory: of NumPy's, a replay would see the first numbers only.
             leaf = mi.Float(value.astype(np.float32).ravel()) * dr.opaque(mi.Float, 1)
             dr.eval(leaf)
-            dr.enable_grad(leaf)
+            if wanted is None or key in wanted:
+                dr.enable_grad(leaf)
+                leaves[key] = leaf
             self.params[key] = from_flat(leaf, type(old), old.shape if dr.is_tensor_v(old) else None)
-            leaves[key] = leaf
         self.params.update()
         self._changed = True
         return leaves

@@ -45,13 +45,14 @@ class LossFunction(Protocol):
         Parameters
         ----------
         image : (H, W, C), float32, linear radiance.
-        target : (H, W, C) or (H, W, 1), linear radiance.
-        weight : (H, W), how much each pixel counts, >= 0.
+        target : (H, W, C) or (H, W, 1), linear radiance; read-only.
+        weight : (H, W), how much each pixel counts, >= 0; read-only.
 
         Returns
         -------
         value : the loss.
-        gradient : (H, W, C), its derivative with respect to each number of the image.
+        gradient : (H, W, C), its derivative with respect to each number of the image. If one is not finite, the step is
+            skipped.
         metrics : label -> number, which the log and the report show.
         """
         ...
@@ -210,6 +211,8 @@ def check(loss: Loss, norms: Iterable[Norm], given: Iterable[str]) -> None:
     for norm in norms:
         if not (callable(norm) or norm in NORMS):
             raise InputError(f"fit: loss.norm must be one of {', '.join(NORMS)}, or in Python a function, got {norm!r}")
+        if hasattr(norm, "parameters") and hasattr(norm, "forward"):
+            raise InputError(f"fit: the loss is a module of PyTorch, give inverse.torch_loss({type(norm).__name__}())")
         if callable(norm) and loss.pyramid:
             raise InputError("fit: loss.pyramid is for the losses by name; a function of your own does without")
     named = loss.rise or loss.fall
@@ -261,9 +264,15 @@ def drjit_loss(function: Callable[[Any, Any, Any], Any], label: str = "") -> Los
 
 
 def value_and_metrics(found: Any) -> tuple[Any, dict[str, float]]:
-    """Of what a function of the user returned: the number, and metrics if there are any."""
-    value, metrics = found if isinstance(found, tuple) else (found, {})
-    return value, {label: float(np.asarray(number).item()) for label, number in metrics.items()}
+    """Of what a function of the user returned: the number, and metrics, if any. InputError : these are none."""
+    try:
+        value, metrics = found if isinstance(found, tuple) else (found, {})
+        plain = lambda number: number.detach() if hasattr(number, "detach") else number  # of PyTorch
+        return value, {label: float(np.asarray(plain(number)).item()) for label, number in metrics.items()}
+    except (TypeError, ValueError, AttributeError):
+        raise InputError(
+            "a loss must return one number, or one number and a dictionary of metrics, numbers by name"
+        ) from None
 
 
 # ------------------------------------------------------------------ pictures

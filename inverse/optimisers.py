@@ -56,7 +56,7 @@ class Optimiser:
     def step(
         self, values: Mapping[str, Any], gradients: Mapping[str, np.ndarray], factor: float, penalty: Any = None
     ) -> bool:
-        """Take a step. False, and no step, if a number would not be finite after it.
+        """Take a step. False, and no step, if a number would not be `Parameter.sound` after it.
 
         values : what `values` returned. gradients : of the loss, with respect to them, by key, flat. factor : of the
             rates. penalty : what is added to the loss, one number, attached to the values.
@@ -72,7 +72,7 @@ class Optimiser:
         before = self.latents()
         self.rule.step(found, {name: rate * factor for name, rate in self.rates.items()})
         self._latents = None
-        if not all(np.isfinite(latent).all() for latent in self.latents().values()):
+        if not all(self.owner[name].sound(latent) for name, latent in self.latents().items()):
             self.restart(before)
             return False
         for name, latent in self.latents().items():

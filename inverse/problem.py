@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args, get_origin
 
 import cattrs
 import numpy as np
@@ -222,8 +222,8 @@ class Problem:
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
     threads: int | None = None
-    """Threads of this process. With 1, a fit that is repeated or resumed ends with the same numbers, bit by bit.
-    Default: one for each core."""
+    """Threads of this process, no more than it has cores. With 1, a fit that is repeated or resumed ends with the same
+    numbers, bit by bit. Default: one for each core."""
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
@@ -234,6 +234,8 @@ class Problem:
         for name in ("free", "stage", "target"):
             entries = getattr(self, name)
             put(name, tuple(entries) if isinstance(entries, tuple | list) else (entries,))
+        if any(t is None for t in self.target):  # what some programs return for a file that is not there
+            raise InputError("fit: a target is None; Target() is the unchanged scene file, rendered")
         targets = (t if isinstance(t, Target) else Target(file=t, sensor=i) for i, t in enumerate(self.target))
         put("target", tuple(targets))
         for name, kind in {"free": Free, "stage": Stage, "starts": Starts, "loss": Loss, "integrator": dict}.items():
@@ -274,6 +276,7 @@ def _converter() -> cattrs.Converter:
     configure_union_passthrough(Value, converter)
     for kind, (told, allowed) in EXACT.items():
         converter.register_structure_hook(kind, _exactly(told, allowed))
+    converter.register_structure_hook_func(lambda kind: get_origin(kind) is Literal, _one_of)
     converter.register_structure_hook(Path, lambda value, _: Path(value))
     converter.register_unstructure_hook(Path, Path.as_posix)
     # "key" may be one name.
@@ -281,6 +284,12 @@ def _converter() -> cattrs.Converter:
     one_key = lambda d: {**d, "key": [d["key"]]} if isinstance(d.get("key"), str) else d
     converter.register_structure_hook(Free, lambda d, kind: structure_free(one_key(d), kind))
     return converter
+
+
+def _one_of(value: Any, kind: Any) -> Any:
+    if value not in get_args(kind):
+        raise InputError(f"fit: expected one of {', '.join(get_args(kind))}, got {value!r}")
+    return value
 
 
 def _exactly(told: str, allowed: tuple[type, ...]) -> Any:
@@ -305,7 +314,9 @@ def read(path: Path | str) -> Problem:
     """
     path = Path(path)
     try:
-        problem = from_text(path.read_text("utf-8"))
+        problem = from_text(path.read_text("utf-8-sig"))  # editors of Windows begin files with a mark
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: it is not UTF-8 (byte {error.start}); save it as that") from None
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     return relative_to(problem, path.parent)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gc
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -194,18 +194,23 @@ class Renderer:
 
     # ---------------------- For layers of other programs ----------------------
 
-    def gradient_of(self, values: Mapping[str, np.ndarray], by_pixel: np.ndarray, task: Task) -> dict[str, np.ndarray]:
+    def gradient_of(
+        self, values: Mapping[str, np.ndarray], by_pixel: np.ndarray, task: Task, wanted: Collection[str]
+    ) -> dict[str, np.ndarray]:
         """The derivative of anything of which that with respect to each number of the picture is known.
 
-        by_pixel : (H, W, C), this one. task : its seed is that of the derivative image.
+        by_pixel : (H, W, C), this one. task : its seed is that of the derivative image. wanted : keys of the values
+        with respect to which it is asked for.
         """
-        (leaves,) = self._set(values, [task])
+        (leaves,) = self._set(values, [task], wanted)
         view = self.views[task.target]
         view.resize(task.width)
         view.backward(by_pixel, task.seed, task.spp)
         return _collected(leaves)
 
-    def _set(self, values: Mapping[str, np.ndarray], tasks: Sequence[Task]) -> list[dict[str, mi.Float]]:
+    def _set(
+        self, values: Mapping[str, np.ndarray], tasks: Sequence[Task], wanted: Collection[str] | None = None
+    ) -> list[dict[str, mi.Float]]:
         """Set the parameters of all scenes of tasks. Returns what collects the gradients of each: key -> flat."""
         views = {task.target: self.views[task.target] for task in tasks}
         for view in views.values():
@@ -213,7 +218,7 @@ class Renderer:
         for task in tasks:
             self.views[task.target].arrange(values, task.width)
         scenes = {id(view.loaded): view.loaded for view in views.values()}
-        return [scene.set(values) for scene in scenes.values()]
+        return [scene.set(values, wanted) for scene in scenes.values()]
 
 
 def _collected(leaves: Mapping[str, mi.Float]) -> dict[str, np.ndarray]:

@@ -155,7 +155,7 @@ def evaluate(
     before, after = (_measures(view, pictures[name]) for name in ("start", "result"))
     floor = losses.root_mean_square(pictures["truth"] - target, weight) if "truth" in pictures else None
     shown = ViewOfFit(pictures["start"], pictures["result"], target, weight)
-    return shown, {label: (before[label], after[label]) for label in before}, floor
+    return shown, {label: (before[label], after[label]) for label in before if label in after}, floor
 
 
 def _image(renderer: Renderer, task: Task, number: int, values: Mapping[str, np.ndarray]) -> np.ndarray:

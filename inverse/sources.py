@@ -50,6 +50,7 @@ def numbers(source: Any) -> np.ndarray:
     """An array, or a tensor of any library, as an array of NumPy. ValueError: it is none."""
     if hasattr(source, "detach"):  # of PyTorch
         source = source.detach().cpu()
+        source = source.float() if source.is_floating_point() else source  # NumPy knows no bfloat16
     array = np.asarray(source)
     if array.dtype.kind not in "fiub":
         what = f"an array of {array.dtype}" if array.ndim else type(source).__name__

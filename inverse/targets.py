@@ -131,7 +131,7 @@ def _decoded(image: np.ndarray, name: str) -> tuple[np.ndarray, bool]:
     if image.ndim == 2:
         image = image[:, :, None]
     if image.ndim != 3 or image.shape[2] > 4:
-        raise InputError(f'fit: "{name}" is no picture of 1 to 4 channels, its shape is {image.shape}')
+        raise InputError(f'fit: "{name}" is no picture of 1 to 4 channels, its shape is {image.shape}, not (H, W, C)')
     if not np.issubdtype(image.dtype, np.unsignedinteger):
         return image.astype(np.float32), False
     return (image / np.iinfo(image.dtype).max).astype(np.float32), True

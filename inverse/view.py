@@ -122,6 +122,7 @@ class View:
                 f"fit: target.{self.number}: no pixel counts at {size[1]} x {size[0]}, each holds something that mask, "
                 "alpha or exclude_above leave out; use a larger resolution"
             )
+        image.flags.writeable = weight.flags.writeable = False  # a loss that changed them would change the fit
         self._smaller = (image, weight), size
         return image, weight
 
@@ -132,7 +133,9 @@ class View:
             raise InputError(
                 f"fit: target.{self.number}: the picture has {target.shape[2]} channels, the film {image.shape[2]}"
             )
-        return self.losses[stage](image, target, weight)
+        value, by_pixel, metrics = self.losses[stage](image, target, weight)
+        # Integrators leave out what is not finite: a gradient of nothing else would look like that of no influence.
+        return value if np.isfinite(by_pixel).all() else float("nan"), by_pixel, metrics
 
     def check(self, stage: int) -> None:
         """Say at once what is wrong with the target, or with the loss of a stage.

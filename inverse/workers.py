@@ -106,6 +106,10 @@ class Workers:
             from distributed import Client, LocalCluster
         except ImportError:
             raise InputError("workers need the package distributed: pip install 'rimlight[cluster]'") from None
+        if cluster is None or isinstance(cluster, bool | float):
+            raise InputError(
+                f"a cluster is a number of processes, the address of a scheduler, or one of Dask, got {cluster!r}"
+            )
         if isinstance(cluster, int) and cluster < 1:
             raise InputError(f"the number of workers must be >= 1, got {cluster}")
         self.threads = threads
@@ -128,7 +132,7 @@ class Workers:
             else:
                 self.client = Client(cluster, timeout=CONNECT, set_as_default=False)
                 self._mine.insert(0, self.client)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, TypeError) as error:
             raise InputError(f'no cluster at "{cluster}": {error}') from None
         if self.client.scheduler is not None:
             self._address = self.client.scheduler.address
@@ -396,11 +400,11 @@ def _thread(threads: int | None, share: int) -> ThreadPoolExecutor:
 
     global _renders
     if _renders is None:
-        count = threads or max(CPU_COUNT // share, 1)
+        count = min(threads or max(CPU_COUNT // share, 1), CPU_COUNT)
         dr.set_thread_count(count)
         _renders = ThreadPoolExecutor(1, thread_name_prefix="rimlight"), count
     pool, count = _renders
-    if threads not in (None, count):
+    if threads is not None and min(threads, CPU_COUNT) != count:
         raise Refusal(
             f"this worker has {count} threads since its first task, and the fit asks for {threads}; restart it"
         )

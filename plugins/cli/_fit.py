@@ -15,12 +15,16 @@ from tyro.conf import Positional, arg
 
 from rimlight import inverse
 from rimlight.inverse import Free, Problem
+from rimlight.inverse import problem as problems
 from rimlight.loading import InputError, expected
 
-from ._loading import at_least, check_output, show_warnings
+from ._loading import at_least, check_output, one_cluster, show_warnings
 
 #: Of more views than so, their mean is printed; the report has all.
 FEW_VIEWS = 4
+
+#: Code of a command that Ctrl-C ended.
+INTERRUPTED = 130
 
 #: What is shown by --help before there is a file.
 EXAMPLE = Problem(scene=Path("scene.xml"), free=(Free(key=("shape.vertex_positions",), kind="pose"),))
@@ -42,6 +46,8 @@ class Fit:
     """Number of processes of this machine that share the work. 0: this process does all of it."""
     cluster: str | None = None
     """Address of the scheduler of a Dask cluster, such as tcp://10.0.0.1:8786, whose workers share the work."""
+    seeds: int = 1
+    """Number of random seeds. With several, each has a fit and a folder of its own, and workers share whole fits."""
     watch: bool = False
     """Show the report while the fit runs, on a page that only this machine can open. Its address is printed."""
     tensorboard: bool = False
@@ -50,8 +56,10 @@ class Fit:
 
     def run(self) -> int:
         at_least(0, workers=self.workers)
+        at_least(1, seeds=self.seeds)
+        one_cluster(self.workers, self.cluster)
         check_output(self.out, folder=True)
-        if not self.resume and (self.out / "checkpoint.npz").exists():
+        if not self.resume and any(self.out.glob("seed_*/checkpoint.npz" if self.seeds > 1 else "checkpoint.npz")):
             raise InputError(f'--out: "{self.out}" holds a fit already; add --resume, or name another folder')
         problem = self.problem
         if self.kind != "joint":
@@ -61,6 +69,8 @@ class Fit:
                 raise InputError(f'nothing of the kind "{self.kind}" is free in "{self.config}", only {kinds}')
             problem = dataclasses.replace(problem, free=free)
         show_warnings()
+        if self.seeds > 1:
+            return self._several(problem)
         with ExitStack() as stack, expected(OSError):
             executor = None
             if self.cluster is not None or self.workers:
@@ -72,31 +82,72 @@ class Fit:
                 watch = stack.enter_context(inverse.Watch(fit, title=self.config.stem))
                 print(f"watch: {watch.url}", flush=True)
             found = fit.run()
-            _print(found)
+            print("\n".join(_said(found)))
             inverse.write(self.out, found, title=self.config.stem)
         print(f"report: {self.out / 'report.html'}")
-        return {"finished": 0, "out of time": 0, "interrupted": 130}.get(found.status, 1)
+        return _code(found)
+
+    def _several(self, problem: Problem) -> int:
+        """Fits of several seeds, on workers or here."""
+        if self.watch or self.tensorboard:
+            raise InputError("--seeds runs several fits; --watch and --tensorboard show one")
+        seeds = range(problem.seed, problem.seed + self.seeds)
+        alike = problems.relative_to(problem, Path.cwd())
+        jobs = [(dataclasses.replace(alike, seed=seed), self.out.resolve() / f"seed_{seed}") for seed in seeds]
+        worst = 0
+        with ExitStack() as stack, expected(OSError):
+            if self.cluster is not None or self.workers:
+                workers = stack.enter_context(inverse.Workers(self.cluster or self.workers, problem.threads))
+                blocks = workers.run(
+                    _whole, self.config.stem, None, [(i / len(jobs), job) for i, job in enumerate(jobs)]
+                )
+                found = (outcome for _, of_block in blocks for outcome in of_block)
+            else:
+                found = (outcome for job in jobs for outcome in _whole(self.config.stem, None, [job]))
+            for seed, (code, lines) in zip(seeds, found, strict=True):
+                print("\n".join(f"seed {seed}: {line}" for line in lines), flush=True)
+                worst = max(worst, code)
+                if code == INTERRUPTED:
+                    break
+        return worst
 
 
-def _print(found: inverse.Result) -> None:
-    print(f"{found.status}: {len(found.losses)} steps in {found.seconds:.1f} s")
+def _whole(title: str, _: None, jobs: Sequence[tuple[Problem, Path]]) -> list[tuple[int, list[str]]]:
+    """Exit codes, and lines for people, of whole fits. What has begun, maybe on a worker that was lost, goes on."""
+    outcomes = []
+    for problem, out in jobs:
+        found = inverse.fit(problem, out=out, resume=(out / "checkpoint.npz").exists(), progress=False)
+        inverse.write(out, found, title=f"{title}, seed {problem.seed}")
+        outcomes.append((_code(found), [*_said(found), f"report: {out / 'report.html'}"]))
+    return outcomes
+
+
+def _code(found: inverse.Result) -> int:
+    """Of the command."""
+    return {"finished": 0, "out of time": 0, "interrupted": INTERRUPTED}.get(found.status, 1)
+
+
+def _said(found: inverse.Result) -> list[str]:
+    """Of a result, for people."""
+    said = [f"{found.status}: {len(found.losses)} steps in {found.seconds:.1f} s"]
     for label, errors in found.errors.items():
-        print(f"  {label}: {errors[0]:.4g} -> {errors[-1]:.4g}")
+        said.append(f"  {label}: {errors[0]:.4g} -> {errors[-1]:.4g}")
     count = len(found.measures)
     of_views = (
         {f"view {i}": [i] for i in range(count)} if count <= FEW_VIEWS else {f"mean of {count} views": range(count)}
     )
     for name, views in of_views.items():
         for label in found.measures[0]:
-            before, after = np.mean([found.measures[i][label] for i in views], axis=0)
-            print(f"  {name}, {label}: {before:.4g} -> {after:.4g}")
+            before, after = np.mean([m[label] for i in views if label in (m := found.measures[i])], axis=0)
+            said.append(f"  {name}, {label}: {before:.4g} -> {after:.4g}")
         if found.floors:
             noise = np.mean([found.floors[i] for i in views])
-            print(f"  {name}, root mean square error at the truth (noise): {noise:.4g}")
+            said.append(f"  {name}, root mean square error at the truth (noise): {noise:.4g}")
     if found.skipped:
-        print(f"  {found.skipped} steps were left out: a number would not have been finite")
+        said.append(f"  {found.skipped} steps were left out: a number would not have been finite")
     for name in found.silent:
-        print(f'  "{name}" has no influence on the pictures')
+        said.append(f'  "{name}" has no influence on the pictures')
+    return said
 
 
 def command(argv: Sequence[str]) -> Any:
@@ -146,6 +197,7 @@ class Reproduce:
 
         at_least(1, seeds=self.seeds)
         at_least(0, workers=self.workers)
+        one_cluster(self.workers, self.cluster)
         check_output(self.out, folder=True)
         show_warnings()
         with ExitStack() as stack, expected(OSError):

@@ -83,6 +83,12 @@ def load_motion(
         )
 
 
+def one_cluster(workers: int, cluster: str | None) -> None:
+    """InputError : both are asked for."""
+    if cluster is not None and workers:
+        raise InputError("--workers starts processes here, --cluster takes those of a cluster; give one of them")
+
+
 def at_least(minimum: int | float, **options: int | float) -> None:
     """Check options of the command line, written as keyword arguments."""
     for name, value in options.items():

@@ -32,7 +32,7 @@ from rimlight.inverse.photometric_stereo import (
 )
 from rimlight.loading import InputError, expected, use_variant
 
-from ._loading import at_least, check_output, show_warnings
+from ._loading import at_least, check_output, one_cluster, show_warnings
 
 #: Of a run that has not finished.
 CHECKPOINT = "checkpoint.npz"
@@ -63,6 +63,7 @@ class Run:
 
     def run(self) -> int:
         at_least(0, images=self.images, threads=self.threads, workers=self.workers)
+        one_cluster(self.workers, self.cluster)
         if not self.folders:
             raise InputError("name a folder with images, lights and a mask")
         show_warnings()

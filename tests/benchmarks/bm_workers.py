@@ -1,11 +1,13 @@
 """Fits over workers: what travels, what it costs, what kills do, and what a model says of many workers.
 
     python tests/benchmarks/bm_workers.py travel
-    python tests/benchmarks/bm_workers.py kills        # of workers
-    python tests/benchmarks/bm_workers.py clients      # of the command
+    python tests/benchmarks/bm_workers.py checkpoints
+    python tests/benchmarks/bm_workers.py crate             # the example of the docs
     python tests/benchmarks/bm_workers.py model
+    python tests/benchmarks/bm_workers.py kills 20 0        # of workers: how many, and a seed
+    python tests/benchmarks/bm_workers.py clients 20 0      # of the command
 
-Each takes a few minutes on two cores.
+Each takes some minutes on two cores, the last one half an hour. Without a name, all are run.
 """
 
 from __future__ import annotations
@@ -38,10 +40,10 @@ VIEWS, WIDTH, TEXTURE = 100, 256, 256
 STEPS = 5
 
 
-def scene_of(folder: Path, width: int = WIDTH) -> Path:
+def scene_of(folder: Path, width: int = WIDTH, texture: int = TEXTURE) -> Path:
     """A textured box on a floor, under a sky, and a ring of cameras around it."""
     rng = np.random.default_rng(0)
-    inverse.page.pictures.write_image(folder / "texture.png", rng.random((TEXTURE, TEXTURE, 3)))
+    inverse.page.pictures.write_image(folder / "texture.png", rng.random((texture, texture, 3)))
     sensors = "".join(
         f"""<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">
         <lookat origin="{5 * np.cos(a):.4f}, 3, {5 * np.sin(a):.4f}" target="0, 0.5, 0" up="0, 1, 0"/></transform>
@@ -180,6 +182,44 @@ def travel() -> None:
     travelled, seconds = found.bytes / found.size, found.step / found.rendering
     print(f"gradient: {found.size} bytes; over the client: {found.bytes:.0f}, {travelled:.3f} times that")
     print(f"step: {found.step:.3f} s; renders of the slower worker: {found.rendering:.3f} s; {seconds:.3f} times that")
+
+
+# ------------------------------------------------------------------ alone
+
+
+def checkpoints() -> None:
+    """Which part of the processor time of a fit its checkpoints take, with that at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        problem = posed(scene_of(Path(folder), texture=2 * TEXTURE), target=Target(spp=16))
+        fit = inverse.Fit(replace(problem, stage=Stage(iterations=100)), out=folder)
+        save, costs = fit.save, []
+
+        def timed(file: Path) -> None:
+            began = time.process_time()
+            save(file)
+            costs.append(time.process_time() - began)
+
+        fit.save = timed  # type: ignore[method-assign]
+        began = time.process_time()
+        for _ in fit:
+            pass
+        whole, size = time.process_time() - began, (Path(folder) / "checkpoint.npz").stat().st_size / 1e6
+        print(f"{len(costs)} checkpoints of {size:.1f} MB: {sum(costs):.2f} of {whole:.1f} s: {sum(costs) / whole:.1%}")
+
+
+def crate() -> None:
+    """The example of the docs: seconds by the clock and of processors, from the start of the command to its report."""
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([sys.executable, "-m", "rimlight.scenes.turntable", folder], check=True)
+        command = [sys.executable, "-m", "rimlight", "fit", "joint", "turntable.toml"]
+        for options in (["--workers", "2"], []):
+            began, before = time.perf_counter(), os.times()
+            subprocess.run([*command, *options, "--out", "-".join(["result", *options])], cwd=folder, check=True)
+            seconds, after = time.perf_counter() - began, os.times()
+            busy = after.children_user + after.children_system - before.children_user - before.children_system
+            print(
+                f"{' '.join(options) or 'alone'}: {seconds:.0f} s by the clock, {busy:.0f} s of processors", flush=True
+            )
 
 
 # ------------------------------------------------------------------ kills
@@ -338,4 +378,7 @@ def model() -> None:
 
 
 if __name__ == "__main__":
-    {"travel": travel, "kills": kills, "clients": clients, "model": model}[sys.argv[1]]()
+    all_of_them = {f.__name__: f for f in (travel, checkpoints, crate, model, kills, clients)}
+    for name in sys.argv[1:2] or all_of_them:
+        print(f"--- {name}", flush=True)
+        all_of_them[name](*map(int, sys.argv[2:]))

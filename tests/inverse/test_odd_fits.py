@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from rimlight import inverse
+from rimlight.cli import main
 from rimlight.inverse import Free, Problem, Stage, Target
+from rimlight.inverse import problem as problems
 
 pytestmark = pytest.mark.usefixtures("no_derivative_image")
 
@@ -126,6 +128,57 @@ def test_regularisers_without_a_derivative(says):
         inverse.Fit(posed(), regularisers=[lambda values: says]).step()
 
 
+def test_gradients_that_are_not_finite_are_counted():
+    """Integrators leave them out, so that they looked like those of a parameter without influence."""
+    loss = lambda image, target, weight: (1.0, np.full_like(image, np.nan), {})
+    found = fitted(loss=loss, stage=Stage(iterations=9, spp=1), max_bad=4)
+    assert found.status == "gave up: 4 steps in a row led to numbers that are not finite"
+    assert found.skipped == len(found.losses) == 4
+
+
+def test_bodies_that_fly_away_are_held_back():
+    """Sines of such angles are not finite."""
+    free = Free(key=BOX, kind="pose", rate=1e12)
+    found = fitted(optimiser="sgd", free=free, stage=Stage(iterations=9, spp=1), max_bad=3)
+    assert found.status == "gave up: 3 steps in a row led to numbers that are not finite"
+    assert all(np.isfinite(value).all() for value in found.values.values())
+
+
+def test_losses_cannot_change_the_target():
+    def loss(image, target, weight):
+        target[:] = 0
+        return 1.0, np.ones_like(image), {}
+
+    with pytest.raises(ValueError, match="read-only"):
+        fitted(loss=loss)
+
+
+def test_metrics_that_come_and_go():
+    """Each is a curve with gaps."""
+    calls = []
+
+    def loss(image, target, weight):
+        calls.append(0)
+        return 1.0, np.ones_like(image), {"odd" if len(calls) % 2 else "even": 1.0}
+
+    found = fitted(loss=loss)
+    np.testing.assert_array_equal(np.isnan(found.scores["odd"]), ~np.isnan(found.scores["even"]))
+
+
+def test_no_more_threads_than_cores():
+    before = dr.thread_count()
+    try:
+        fitted(threads=500)
+        assert dr.thread_count() <= (os.cpu_count() or 1)
+    finally:
+        dr.set_thread_count(before)
+
+
+def test_functions_that_are_none():
+    with pytest.raises(ValueError, match=r"^fit: on_step must be functions, got 3$"):
+        inverse.Fit(posed(), on_step=3)
+
+
 def test_one_function_in_place_of_several():
     seen: list[inverse.Step] = []
     fit = inverse.Fit(posed(), regularisers=inverse.prior(BALL, 0.5, 1), on_step=seen.append)
@@ -152,6 +205,7 @@ def test_executors_that_are_none(executor):
         ({"free": Free(key=BOX, kind="pose", move="", turn="")}, '"box" cannot move'),
         ({"free": Free(key=BOX, kind="shape", move="")}, '"box" cannot move'),
         ({"target": ["nothing.png"]}, 'there is no file "nothing.png"'),
+        ({"target": [None]}, r"a target is None; Target\(\) is the unchanged scene file"),
     ],
 )
 def test_fits_of_nothing(options, culprit):
@@ -159,7 +213,33 @@ def test_fits_of_nothing(options, culprit):
         inverse.Fit(posed(**options))
 
 
-# ------------------------------------------------------------------ folders
+# ------------------------------------------------------------------ files and folders
+
+TOML = 'scene = "s.xml"\n[[free]]\nkey = "a"\nkind = "{}"\n'
+
+
+def test_files_of_other_editors(tmp_path):
+    """Those of Windows begin files with a mark, and may not write UTF-8."""
+    file = tmp_path / "Größe 1.toml"
+    file.write_text(TOML.format("light").replace("\n", "\r\n"), "utf-8-sig")
+    assert problems.read(file).free[0].kind == "light"
+    file.write_text("# grün\n" + TOML.format("light"), "latin-1")
+    with pytest.raises(ValueError, match=r"Größe 1\.toml: it is not UTF-8 \(byte 4\); save it as that$"):
+        problems.read(file)
+
+
+def test_a_kind_that_is_none(tmp_path):
+    (tmp_path / "fit.toml").write_text(TOML.format("mat"), "utf-8")
+    with pytest.raises(ValueError, match=r"expected one of pose, material, light, shape, got 'mat' @ fit\.free"):
+        problems.read(tmp_path / "fit.toml")
+
+
+@pytest.mark.parametrize("command", ["fit joint fit.toml", "reproduce fig6a"])
+def test_workers_of_two_clusters(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fit.toml").write_text(TOML.format("light"), "utf-8")
+    assert main([*command.split(), "--out", "out", "--workers", "1", "--cluster", "tcp://127.0.0.1:1"]) == 2
+    assert "--cluster takes those of a cluster; give one of them" in capsys.readouterr().err
 
 
 def test_what_is_no_checkpoint(tmp_path):

@@ -10,11 +10,11 @@ import signal
 
 import numpy as np
 import pytest
-from machines import assert_same, fit_while, posed, run_fit, values_of, wait_for
+from machines import COLOUR, assert_same, fit_while, posed, run_fit, values_of, wait_for
 
 from rimlight import inverse
 from rimlight.cli import main
-from rimlight.inverse import executors, fitting, packing, workers
+from rimlight.inverse import executors, fitting, packing, reproduce, workers
 from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Stage, Target
 from rimlight.inverse.renderer import Gradient
@@ -151,7 +151,13 @@ def test_a_cluster_works_for_its_own_problem():
 
 
 @pytest.mark.parametrize(
-    ("cluster", "culprit"), [("nonsense://1", 'no cluster at "nonsense://1"'), (0, "workers must be >= 1, got 0")]
+    ("cluster", "culprit"),
+    [
+        ("nonsense://1", 'no cluster at "nonsense://1"'),
+        ([2], r'no cluster at "\[2\]"'),
+        (0, "workers must be >= 1, got 0"),
+        (None, "a cluster is a number of processes, the address of a scheduler, or one of Dask, got None"),
+    ],
 )
 def test_there_must_be_a_cluster(cluster, culprit):
     with pytest.raises(ValueError, match=culprit) as error:
@@ -171,6 +177,30 @@ def test_the_command_starts_workers(tmp_path, capfd):
     assert main([*arguments, "--out", str(tmp_path / "bad")]) == 2
     (line,) = capfd.readouterr().err.splitlines()
     assert '"small.png" has 9 x 8 pixels' in line and "said by the worker" in line
+
+
+def test_seeds_share_workers(tmp_path, capfd):
+    """Each has a fit and a folder of its own; those that are done are not done again."""
+    problems.write(tmp_path / "fit.toml", posed(steps=3))
+    arguments = ["fit", "joint", str(tmp_path / "fit.toml"), "--out", str(tmp_path / "out"), "--seeds", "2"]
+    assert main([*arguments, "--workers", "1"]) == 0
+    said = capfd.readouterr().out
+    assert "seed 0: finished: 3 steps" in said and "seed 1: finished: 3 steps" in said
+    first, second = (values_of(tmp_path / "out" / f"seed_{seed}") for seed in (0, 1))
+    assert first.keys() == second.keys() and not np.array_equal(first[COLOUR], second[COLOUR])
+    assert main(arguments) == 2
+    assert "holds a fit already; add --resume" in capfd.readouterr().err
+    assert main([*arguments, "--resume"]) == 0
+    assert_same(values_of(tmp_path / "out" / "seed_1"), second)
+    assert main([*arguments, "--resume", "--watch"]) == 2
+
+
+@pytest.mark.slow
+def test_reproductions_share_workers(tmp_path):
+    """Each fit runs as a whole on one of them, and reports."""
+    with inverse.Workers(1) as one:
+        (outcome,) = reproduce.reproduce("fig6a", tmp_path, seeds=[3], workers=one)
+    assert outcome.left < 0.05 and (tmp_path / "fig6a" / "ours_3" / "report.html").exists()
 
 
 # ------------------------------------------------------------------ what travels
