@@ -22,6 +22,7 @@ extensions = [
     "sphinx_inline_tabs",
     "sphinxcontrib.bibtex",
     "accessible",
+    "examples",
     "house_docstrings",
     "plugin_pages",
 ]

@@ -1,9 +1,9 @@
 """The documentation in a real browser:  make browse,  or  python tests/browse.py docs/_build/html [FOLDER]
 
-Every page is opened in light and dark colours, as wide as a desk and as narrow as a phone. Each has to pass the rules of
-axe-core for accessibility, to fit into the width, and to show all of its pictures. Then words that newcomers may type are
-searched for. With a FOLDER, a picture of each page is written there. Nothing is downloaded: requests to other machines
-fail, so that formulas, which MathJax draws, are checked as they are written.
+Every page is opened in light and dark colours, as wide as a desk and as narrow as a phone. Each has to pass the rules
+of axe-core for accessibility, to fit into the width, and to show all of its pictures. Then words that newcomers may
+type are searched for. With a FOLDER, a picture of each page is written there. Nothing is downloaded: requests to other
+machines fail, so that formulas, which MathJax draws, are checked as they are written.
 
 Where there is no browser, or no `axe-playwright-python` (the extra `browse`), this says so and checks nothing.
 """
