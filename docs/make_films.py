@@ -1,7 +1,7 @@
 """Films of fits for the documentation:  python docs/make_films.py FIGURES
 
-FIGURES is the folder that `rimlight reproduce all --out FIGURES` has written. Of each fit, its convergence.gif is thinned
-and written as docs/images/films/NAME.webp, of at most LARGEST bytes.
+FIGURES is the folder that `rimlight reproduce all --out FIGURES` has written. Of each fit, its convergence.gif is
+thinned and written as docs/images/films/NAME.webp, of at most LARGEST bytes.
 """
 
 from __future__ import annotations
