@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import re
 from abc import ABC, abstractmethod
@@ -13,7 +14,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.meshes import as_parameter, faces_of_positions, is_positions_key, points
+from rimlight.edge_sampling.geometry.meshes import (
+    as_parameter,
+    faces_of_positions,
+    is_positions_key,
+    points,
+    present_key,
+)
 from rimlight.edge_sampling.refusals import InputError
 
 from .problem import Free
@@ -244,6 +251,7 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
     """
     found: list[Parameter] = []
     for entry in free:
+        entry = dataclasses.replace(entry, key=tuple(present_key(params, key) for key in entry.key))
         for key in entry.key:
             _check_key(key, params)
         moves_whole = lambda key, kind=entry.kind: (

@@ -204,6 +204,21 @@ def test_uses_are_read_off_code():
     assert used(code) == {f"rimlight.inverse.photometric_stereo{rest}" for rest in ("", ".read")}
 
 
+def test_pages_are_mended_once():
+    """What furo and Sphinx lack for accessibility (`make browse` checks the pages in a browser)."""
+    accessible = from_file(ROOT / "docs" / "_ext" / "accessible.py")
+    for old, new in accessible.REPLACEMENTS.items():
+        once = accessible.mend(f"<p>{old}</p>")
+        assert once == accessible.mend(once) == f"<p>{new}</p>"
+
+
+def test_films_are_small():
+    films = list((ROOT / "docs" / "images" / "films").glob("*.webp"))
+    assert films
+    assert all(film.stat().st_size < 1_000_000 for film in films)
+    assert sum(film.stat().st_size for film in films) < 6_000_000
+
+
 def from_file(path: Path):
     """A module that is in no package."""
     specification = importlib.util.spec_from_file_location(path.stem, path)

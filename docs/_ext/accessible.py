@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from sphinx.application import Sphinx
+if TYPE_CHECKING:  # the tests of this file need no Sphinx
+    from sphinx.application import Sphinx
 
 #: Text of the pages, and what is written in its place. Each replacement may be done again to a page that has it.
 REPLACEMENTS = {

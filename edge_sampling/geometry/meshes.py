@@ -175,6 +175,16 @@ def positions_key(params: Any) -> str:
     return next(key for key in params.keys() if is_positions_key(key))  # noqa: SIM118 (no dictionary)
 
 
+def present_key(params: Any, key: str) -> str:
+    """A key of `params`, or for the name of positions or normals in one interface that of the other."""
+    body, dot, name = key.rpartition(".")
+    short = name.removeprefix("vertex_")
+    if key in params or short not in ("positions", "normals"):
+        return key
+    other = body + dot + (f"vertex_{name}" if short == name else short)
+    return other if other in params else key
+
+
 def points(value: Any) -> mi.Point3f:
     """A parameter of positions or normals, in either interface, as points: (P,), attached if it is."""
     return dr.unravel(mi.Point3f, value.array if dr.is_tensor_v(value) else value)

@@ -144,6 +144,21 @@ def test_keys_of_positions(key, expected):
     assert meshes.is_positions_key(key) is expected
 
 
+@pytest.mark.parametrize(
+    ("key", "present", "expected"),
+    [
+        ("cube.vertex_positions", "cube.positions", "cube.positions"),
+        ("cube.positions", "cube.vertex_positions", "cube.vertex_positions"),
+        ("vertex_normals", "normals", "normals"),
+        ("cube.vertex_positions", "ball.positions", "cube.vertex_positions"),
+        ("cube.vertex_color", "cube.color", "cube.vertex_color"),
+        ("cube.positions", "cube.positions", "cube.positions"),
+    ],
+)
+def test_scenes_of_one_interface_name_the_parameters_of_the_other(key, present, expected):
+    assert meshes.present_key({present: None}, key) == expected
+
+
 def test_motions_of_tensors_are_those_of_flat_arrays(variant, monkeypatch):
     """`rimlight check` and its like: the same vertices move by the same vector."""
 
