@@ -107,7 +107,7 @@ class Bench:
     """JSON file to write, to share or to compare. The table is printed."""
     spp: int = 16
     """Samples per pixel of a derivative."""
-    seconds: float = 8
+    seconds: float = 6
     """Time for the calls of one method in one scene."""
 
     def run(self) -> int:
