@@ -4,6 +4,8 @@
 # Other commands follow the name of the image:
 #   docker run --rm rimlight sys-info
 FROM python:3.12-slim
+# LLVM needs it
+RUN apt-get update && apt-get install -y --no-install-recommends libatomic1 && rm -rf /var/lib/apt/lists/*
 COPY . /source
 RUN pip install --no-cache-dir /source && rm -rf /source
 WORKDIR /

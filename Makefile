@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: setup demo test test-fast test-full mutants bench photometric docs lint dist clean
+.PHONY: setup demo test test-fast test-full mutants bench photometric docs browse lint dist clean
 
 setup: $(STAMP)
 
@@ -59,6 +59,10 @@ $(DEMO): inverse/demo.py $(STAMP)
 
 docs: setup $(DEMO)
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+# Accessibility of the pages, and their search, in a browser; says so and does nothing where there is none
+browse: docs
+	$(BIN)/python tests/browse.py docs/_build/html
 
 lint: setup
 	$(BIN)/ruff check .

@@ -21,6 +21,8 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx_inline_tabs",
     "sphinxcontrib.bibtex",
+    "accessible",
+    "examples",
     "house_docstrings",
     "plugin_pages",
 ]
@@ -41,7 +43,10 @@ html_theme = "furo"
 html_theme_options = {"sidebar_hide_name": False}
 # The demo, as `make docs` has made it
 html_extra_path = [str(p) for p in [Path(__file__).parent / "_build" / "extra"] if p.is_dir()]
-html_show_sphinx = html_show_copyright = False
+html_static_path = ["_static"]
+html_js_files = ["scrollable.js"]
+html_search_scorer = str(Path(__file__).parent / "_static" / "scorer.js")
+html_show_sphinx = html_show_copyright = html_copy_source = html_show_sourcelink = False
 exclude_patterns = ["_build", "performance/*"]  # tables that index pages include
 math_eqref_format = "({number})"
 math_numfig = False

@@ -314,7 +314,8 @@ def text(numbers: dict[str, dict[str, Any]]) -> str:
         "",
         "*What do correct derivatives look like?* Each row shows a scene that is shipped with Rimlight, its derivative "
         "by Rimlight, and the same derivative by finite differences. Red pixels get brighter, and blue pixels get "
-        "darker. Both derivatives share one scale.",
+        "darker. Both derivatives share one scale. {doc}`papers` has films of fits, and the figures of the papers "
+        "beside ours.",
         "",
         "The **error** is the {term}`relative L1 error` against the finite differences. The **noise** is the error "
         "that an exact derivative would show, since both sides are Monte Carlo estimates. Where both are equal, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import re
 from abc import ABC, abstractmethod
@@ -13,6 +14,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.geometry.meshes import (
+    as_parameter,
+    faces_of_positions,
+    is_positions_key,
+    points,
+    present_key,
+)
 from rimlight.edge_sampling.refusals import InputError
 
 from .problem import Free
@@ -106,7 +114,7 @@ class RigidBody(Parameter):
         shift, rotation = (dr.unravel(mi.Vector3f, latents[k]) for k in (self.move, self.turn))
         moved = rotate_and_shift(rotation, shift, mi.Point3f(self.centre))
         return {
-            key: moved @ value if is_transform(value) else dr.ravel(moved @ dr.unravel(mi.Point3f, value))
+            key: moved @ value if is_transform(value) else as_parameter(dr.ravel(moved @ points(value)), value)
             for key, value in ((key, so_far.get(key, initial)) for key, initial in self.initial.items())
         }
 
@@ -142,9 +150,9 @@ class RigidBody(Parameter):
 class Vertices(Parameter):
     """Vertex positions, one by one. Vertices of equal position stay together, so that seams do not open."""
 
-    def __init__(self, name: str, free: Free, key: str, initial: mi.Float, faces: mi.UInt):
+    def __init__(self, name: str, free: Free, key: str, initial: Any, faces: np.ndarray):
         super().__init__(name, free, [key])
-        self.key = key
+        self.key, self.kind = key, type(initial)
         place = np.array(initial, np.float32).reshape(-1, 3)
         _, first, weld = np.unique(place, axis=0, return_index=True, return_inverse=True)
         self.first, self.weld = first, mi.UInt(weld.ravel())
@@ -160,13 +168,16 @@ class Vertices(Parameter):
 
     def _latent(self, place: np.ndarray) -> np.ndarray:
         if self.large_steps:
-            return np.array(self.large_steps.to_differential(mi.Float(place.ravel())), np.float32)
+            return np.array(self.large_steps.to_differential(mi.Float(place.ravel())), np.float32).ravel()
         return place[self.first].ravel()
 
     def values(self, latents, so_far=NOTHING):
         if self.large_steps:
-            return {self.key: self.large_steps.from_differential(latents[self.key])}
-        return {self.key: dr.ravel(dr.gather(mi.Point3f, latents[self.key], self.weld))}
+            found = self.large_steps.from_differential(latents[self.key])
+            flat = found.array if dr.is_tensor_v(found) else found
+        else:
+            flat = dr.ravel(dr.gather(mi.Point3f, latents[self.key], self.weld))
+        return {self.key: as_parameter(flat, self.kind())}
 
     def mask(self, name):
         return None if self.large_steps else self.chosen
@@ -250,10 +261,11 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
     """
     found: list[Parameter] = []
     for entry in free:
+        entry = dataclasses.replace(entry, key=tuple(present_key(params, key) for key in entry.key))
         for key in entry.key:
             check_key(key, params)
         moves_whole = lambda key, kind=entry.kind: (
-            is_transform(params[key]) or (kind == "pose" and key.endswith("vertex_positions"))
+            is_transform(params[key]) or (kind == "pose" and is_positions_key(key))
         )
         rigid = [key for key in entry.key if moves_whole(key)]
         _check_free_once(entry, rigid, found)
@@ -265,9 +277,8 @@ def find(free: Iterable[Free], params: Any) -> list[Parameter]:
         for key in entry.key:
             if key in rigid:
                 continue
-            if key.endswith("vertex_positions"):
-                faces = params[key.replace("vertex_positions", "faces")]
-                found.append(Vertices(_body(key), entry, key, _copy(params[key]), faces))
+            if is_positions_key(key):
+                found.append(Vertices(_body(key), entry, key, _copy(params[key]), faces_of_positions(params, key)))
             else:
                 found.append(Values(key, entry, key, _copy(params[key])))
     for parameter in found:
@@ -388,8 +399,9 @@ def _numbers(numbers: tuple[float, ...], counts: set[int], name: str, expected: 
     return np.array(numbers, np.float64)
 
 
-def _large_steps(positions: mi.Float, faces: mi.UInt, smoothing: float) -> Any:
+def _large_steps(positions: Any, faces: np.ndarray, smoothing: float) -> Any:
+    triangles = mi.TensorXu(faces) if dr.is_tensor_v(positions) else mi.UInt(faces.ravel())
     try:
-        return mi.ad.LargeSteps(positions, faces, smoothing)
+        return mi.ad.LargeSteps(positions, triangles, smoothing)
     except ImportError as error:
         raise InputError("fit: smoothing needs the package cholespy: pip install cholespy") from error

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.geometry.meshes import points
 from rimlight.edge_sampling.refusals import InputError
 
 #: Scene parameters, key -> value, attached -> one number.
@@ -37,7 +38,8 @@ def smooth_mesh(key: str, faces: Any, strength: float) -> Regulariser:
     """Vertices near the middle of their neighbours: `strength` times the mean of their squared distances from it, in
     scene units squared (the uniform Laplacian of Sorkine 2005).
 
-    key : such as "body.vertex_positions". faces : (F, 3) or flat, numbers of vertices: `params["body.faces"]`.
+    key : such as "body.vertex_positions". faces : (F, 3) or flat, numbers of vertices: `params["body.faces"]`; of
+        positions in Mitsuba 3.10: `mesh.geometric_faces()`.
     """
     triangles = np.array(faces, np.uint32).reshape(-1, 3)
     ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
@@ -47,7 +49,7 @@ def smooth_mesh(key: str, faces: Any, strength: float) -> Regulariser:
     share = mi.Float(1 / np.maximum(np.bincount(ends[:, 0]), 1)[ends[:, 0]].astype(np.float32))
 
     def penalty(values: Mapping[str, Any]) -> mi.Float:
-        place = dr.unravel(mi.Point3f, values[key])
+        place = points(values[key])
         towards = share * (dr.gather(mi.Point3f, place, j) - dr.gather(mi.Point3f, place, i))
         squares = mi.Float(0)
         for component in towards:

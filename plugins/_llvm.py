@@ -22,6 +22,7 @@ MIN_MAJOR = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 PACKAGE = "karellen-llvm-core"
 REMEDY = f"Run `pip install {PACKAGE}`, or set {VARIABLE} to the file of an LLVM >= {MIN_MAJOR}."
+ATOMIC = "Install libatomic; on Debian and Ubuntu: apt install libatomic1."
 
 # Dr.Jit switches its LLVM backend off when the variable names a file that does not exist; its own search is not run.
 DISABLED = f"{os.sep}no-usable-llvm{os.sep}libLLVM.so"
@@ -189,7 +190,9 @@ def find(
                 )
             return llvm
     reasons = "".join(f"\n  {file} {reason}" for file, reason in refused.items())
-    raise ImportError(f"rimlight: no usable LLVM library (>= {MIN_MAJOR}) was found. {REMEDY}{reasons}")
+    # That of the Python environment is there then, and small containers lack what it needs
+    remedy = ATOMIC if "libatomic" in reasons else REMEDY
+    raise ImportError(f"rimlight: no usable LLVM library (>= {MIN_MAJOR}) was found. {remedy}{reasons}")
 
 
 def other_backend() -> str | None:

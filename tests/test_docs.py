@@ -184,12 +184,53 @@ def test_a_failing_snippet_is_noticed(tmp_path):
     assert f'{page}", line 7' in result.stderr
 
 
+def test_every_public_function_has_an_example():
+    """All that the API page lists is used by Python that the tests run, or linked to beside such code."""
+    examples = from_file(ROOT / "docs" / "_ext" / "examples.py")
+    module, listed = "", []
+    for kind, name in re.findall(r"^\.\. (\w+):: ([\w.]+)$", read(ROOT / "docs" / "api.md"), re.MULTILINE):
+        if kind == "currentmodule":
+            module = name
+        elif kind in ("autofunction", "autoclass", "automethod"):
+            listed.append(name if name.startswith("rimlight.") else f"{module}.{name}")
+    assert len(listed) >= 90
+    assert not [name for name in listed if not examples.examples(name)]
+
+
+def test_uses_are_read_off_code():
+    used = from_file(ROOT / "docs" / "_ext" / "examples.py").used
+    assert used("import rimlight\nrimlight.plan(1)") == {"rimlight", "rimlight.plan"}
+    code = "from rimlight.inverse import photometric_stereo as ps\nimport numpy as np\nnp.ones(ps.read(x).images)"
+    assert used(code) == {f"rimlight.inverse.photometric_stereo{rest}" for rest in ("", ".read")}
+
+
+def test_pages_are_mended_once():
+    """What furo and Sphinx lack for accessibility (`make browse` checks the pages in a browser)."""
+    accessible = from_file(ROOT / "docs" / "_ext" / "accessible.py")
+    for old, new in accessible.REPLACEMENTS.items():
+        once = accessible.mend(f"<p>{old}</p>")
+        assert once == accessible.mend(once) == f"<p>{new}</p>"
+
+
+def test_films_are_small():
+    films = list((ROOT / "docs" / "images" / "films").glob("*.webp"))
+    assert films
+    assert all(film.stat().st_size < 1_000_000 for film in films)
+    assert sum(film.stat().st_size for film in films) < 6_000_000
+
+
+def from_file(path: Path):
+    """A module that is in no package."""
+    specification = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[path.stem] = module  # data classes look there
+    specification.loader.exec_module(module)
+    return module
+
+
 def test_the_gallery_shows_every_scene():
     """Shipped scenes, with a picture of each entry; and the page is what `docs/make_gallery.py` writes."""
-    specification = importlib.util.spec_from_file_location("make_gallery", ROOT / "docs" / "make_gallery.py")
-    gallery = importlib.util.module_from_spec(specification)
-    sys.modules["make_gallery"] = gallery  # data classes look there
-    specification.loader.exec_module(gallery)
+    gallery = from_file(ROOT / "docs" / "make_gallery.py")
     numbers = json.loads(gallery.NUMBERS.read_text("utf-8"))
     assert (ROOT / "docs" / "gallery.md").read_text("utf-8") == gallery.text(numbers)
     shown = {entry.scene for entry in gallery.ENTRIES}

@@ -89,3 +89,36 @@ def test_the_glossary_covers_the_terms():
                 missing.append((page.name, target or name))
     assert not missing
     assert {"edge", "silhouette", "interior term", "boundary term", "jump"} <= known
+
+
+#: Ordinary words that stand in bold because they matter in their sentence.
+STRESSED = {
+    "affine in", "affine in the point", "as seen on the film", "away from", "every", "long", "ours", "part", "short",
+    "towards", "point in the world",
+}  # fmt: skip
+
+#: What follows a term that is explained where it stands, as the head of a row, a list or a sentence.
+EXPLAINED = re.compile(r":| is | are | means| \||, ")
+
+
+def unexplained(text: str, known: set[str]) -> list[str]:
+    """Terms in bold (in small letters: titles and labels begin with a capital) that the glossary does not have."""
+    found = []
+    for match in re.finditer(r"(?<!\*)\*\*([a-z][a-z -]+)\*\*", re.sub(r"```.*?```", "", text, flags=re.DOTALL)):
+        name, rest = match[1], match.string[match.end() :]
+        forms = {name, name.removesuffix("s"), f"{name} term", name.replace("welded by position", "welding")}
+        if not (forms & known or name in STRESSED or EXPLAINED.match(rest)):
+            found.append(name)
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_terms_in_bold_are_in_the_glossary(page):
+    if page.name != "random_scenes.md":  # a list of what is random
+        assert not unexplained(page.read_text("utf-8"), terms())
+
+
+def test_unexplained_terms_are_noticed():
+    assert unexplained(
+        "A **flux capacitor** and a **silhouette**. A **rim**: the border. **Why.**", {"silhouette"}
+    ) == (["flux capacitor"])

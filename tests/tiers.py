@@ -136,6 +136,7 @@ test_distant_lights.py::test_derivatives_of_images[angular_radius
 test_distant_lights.py::test_derivatives_of_images[background.value-diffuse]
 test_distant_lights.py::test_derivatives_of_images[directions-diffuse]
 test_distant_lights.py::test_derivatives_of_images[irradiance
+test_docs.py::test_snippets_run[adversarial_scene.md]
 test_docs.py::test_snippets_run[bowl_under_many_lights.md]
 test_docs.py::test_snippets_run[camera_calibration.md]
 test_docs.py::test_snippets_run[check_any_gradient.md]

@@ -46,9 +46,7 @@ def _escape(match: re.Match[str]) -> str:
 
 
 def _process(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    if lines and name.startswith(
-        ("rimlight.checks", "rimlight.edge_sampling", "rimlight.inverse", "rimlight.merl_tables", "rimlight.ggx")
-    ):
+    if lines and name.startswith("rimlight."):
         lines[:] = convert(lines)
 
 

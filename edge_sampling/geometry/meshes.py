@@ -170,6 +170,88 @@ def is_positions_key(key: str) -> bool:
     return key.rpartition(".")[2] in ("vertex_positions", "positions")
 
 
+def positions_key(params: Any) -> str:
+    """The name of the positions among the parameters of a mesh."""
+    return next(key for key in params.keys() if is_positions_key(key))  # noqa: SIM118 (no dictionary)
+
+
+def present_key(params: Any, key: str) -> str:
+    """A key of `params`, or for the name of positions or normals in one interface that of the other."""
+    body, dot, name = key.rpartition(".")
+    short = name.removeprefix("vertex_")
+    if key in params or short not in ("positions", "normals"):
+        return key
+    other = body + dot + (f"vertex_{name}" if short == name else short)
+    return other if other in params else key
+
+
+def points(value: Any) -> mi.Point3f:
+    """A parameter of positions or normals, in either interface, as points: (P,), attached if it is."""
+    return dr.unravel(mi.Point3f, value.array if dr.is_tensor_v(value) else value)
+
+
+def as_parameter(rows: np.ndarray | mi.Float, like: Any) -> Any:
+    """Positions or normals, (P, 3) or flat, as the type of the parameter `like` wants them; attached if they are.
+    NumPy's are copied into Dr.Jit's memory."""
+    if isinstance(rows, np.ndarray):
+        rows = mi.Float(np.asarray(rows, np.float32).ravel())
+        dr.make_opaque(rows)
+    return type(like)(rows, (dr.width(rows) // 3, 3)) if dr.is_tensor_v(like) else rows
+
+
+def faces_of_positions(params: Any, key: str) -> np.ndarray:
+    """Triangles by the rows of the parameter `key` of positions, which vertices of Mitsuba 3.10 share: (F, 3), uint32,
+    on the host."""
+    sibling = lambda name: f"{key.rpartition('.')[0]}.{name}".lstrip(".")
+    found = np.array(params[sibling("faces")], np.uint32).reshape(-1, 3)
+    shared = sibling("position_index")
+    return np.array(params[shared], np.uint32)[found] if shared in params and dr.width(params[shared]) else found
+
+
+def make_mesh(
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    normals: np.ndarray | None = None,
+    bsdf: mi.BSDF | None = None,
+    attributes: dict[str, np.ndarray] | None = None,
+) -> mi.Mesh:
+    """A mesh with normals of its vertices.
+
+    vertices : (V, 3), world space. faces : (F, 3). normals : (V, 3); None: as Mitsuba makes them. attributes : by name,
+        such as ``vertex_color``: (V, K).
+    """
+    props = mi.Properties()
+    if bsdf is not None:
+        props["mesh_bsdf"] = bsdf
+    faces = faces.astype(np.uint32)
+    attributes = {k: np.asarray(v, np.float32).reshape(len(vertices), -1) for k, v in (attributes or {}).items()}
+    if hasattr(mi.Mesh, OLD):
+        mesh = mi.Mesh(name, len(vertices), len(faces), props, has_vertex_normals=True)
+        for key, values in attributes.items():
+            mesh.add_attribute(key, values.shape[1], values.ravel())
+        params = mi.traverse(mesh)
+        params["faces"] = mi.UInt32(faces.ravel())
+        params["vertex_positions"] = as_parameter(vertices, mi.Float())
+        params.update()
+        if normals is not None:  # after the positions, an update of which makes normals anew
+            params["vertex_normals"] = as_parameter(normals, mi.Float())
+            params.update()
+        return mesh
+    props.set_id(name)
+    mesh = mi.Mesh(props)
+    tensor = lambda rows: as_parameter(rows, mi.TensorXf())
+    mesh.from_fields(
+        mi.TensorXu(faces), tensor(vertices), tensor(np.zeros_like(vertices) if normals is None else normals)
+    )
+    for key, values in attributes.items():
+        mesh.add_attribute(key, mi.TensorXf(values))
+    if normals is None:
+        mesh.recompute_normals()
+    return mesh
+
+
 def attribute_names(mesh: Any, of: str = "vertex_") -> list[str]:
     """Names of the attributes of the vertices, or ``face_`` of the faces."""
     known = ("vertex_positions", "vertex_normals", "vertex_texcoords")

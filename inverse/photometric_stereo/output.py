@@ -15,10 +15,11 @@ from matplotlib.figure import Figure
 
 import rimlight
 from rimlight import ggx
+from rimlight.edge_sampling.geometry.meshes import make_mesh
 from rimlight.exr import replacing, write_exr
 from rimlight.inverse import page
 
-from .direct import bsdf_of, own
+from .direct import bsdf_of
 from .integration import depth_error, mesh_of
 from .reconstruction import Options, Result
 
@@ -118,7 +119,7 @@ def write_pictures(folder: Path, result: Result) -> None:
     with replacing(folder / "bsdf.png") as temporary:
         figure.savefig(temporary, format="png", dpi=DPI)
     vertices, faces, _ = mesh_of(data.image(depth(result)), data.mask, camera=data.camera)
-    mesh = make_mesh(vertices, faces, result.guess.normals)
+    mesh = make_mesh("object", vertices, faces, normals=result.guess.normals)
     mesh.add_attribute("vertex_albedo", 1, result.guess.albedo.astype(np.float32))
     with replacing(folder / "mesh.ply") as temporary:
         mesh.write_ply(str(temporary))
@@ -172,22 +173,6 @@ def bsdf(result: Result) -> tuple[np.ndarray, float]:
 
 def versions() -> dict[str, str]:
     return {"rimlight": rimlight.__version__, "mitsuba": mi.__version__, "drjit": dr.__version__}
-
-
-def make_mesh(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, bsdf: mi.BSDF | None = None) -> mi.Mesh:
-    """vertices, normals : (V, 3). faces : (F, 3)."""
-    props = mi.Properties()
-    if bsdf is not None:
-        props["mesh_bsdf"] = bsdf
-    mesh = mi.Mesh("object", len(vertices), len(faces), props, has_vertex_normals=True)
-    params = mi.traverse(mesh)
-    params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
-    params["vertex_positions"] = own(vertices)
-    params.update()
-    # After the positions, an update of which makes normals anew
-    params["vertex_normals"] = own(normals)
-    params.update()
-    return mesh
 
 
 # ---------------------- Plot of the BSDF ----------------------

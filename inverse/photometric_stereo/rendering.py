@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from rimlight import ggx, leds, no_collection
+from rimlight.edge_sampling.geometry.meshes import make_mesh
 from rimlight.edge_sampling.refusals import InputError
 
 from .dataset import Dataset
@@ -128,18 +129,11 @@ class Rendering:
         self.data, self.domain, self.lobes, self.max_depth = data, Domain(data), lobes, max_depth
         vertices, faces = self.domain.mesh(np.ones(self.domain.wide.sum()))
         Q = len(vertices)
-        props = mi.Properties()
         self.several = several
         base = "vertex_base" if several else None
-        props["mesh_bsdf"] = bsdf_of(lobes, np.zeros((len(lobes), 3)), scale="vertex_albedo", base=base, eta=base_eta)
-        mesh = mi.Mesh("object", Q, len(faces), props, has_vertex_normals=True)
-        mesh.add_attribute("vertex_albedo", 1, np.ones(Q, np.float32))
-        if several:
-            mesh.add_attribute("vertex_base", 3, np.ones(3 * Q, np.float32))
-        params = mi.traverse(mesh)
-        params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
-        params["vertex_positions"] = own(vertices)
-        params.update()
+        bsdf = bsdf_of(lobes, np.zeros((len(lobes), 3)), scale="vertex_albedo", base=base, eta=base_eta)
+        colours = {"vertex_albedo": np.ones((Q, 1))} | ({"vertex_base": np.ones((Q, 3))} if several else {})
+        mesh = make_mesh("object", vertices, faces, bsdf=bsdf, attributes=colours)
         self.scene = mi.load_dict({"type": "scene", "object": mesh, "sensor": self._sensor(), **self._lights()})
         self.params = mi.traverse(self.scene)
         # The camera sees points that move along its rays: no edge moves on the film
@@ -150,8 +144,14 @@ class Rendering:
     # ---------------------- Scene ----------------------
 
     def key(self, name: str) -> str:
-        """Of a parameter that ends so."""
-        return next(k for k in self.params.keys() if k.endswith(name))  # noqa: SIM118
+        """Of a parameter that ends so; positions and normals have shorter names in Mitsuba 3.10."""
+        names = (name, name.removeprefix("vertex_"))
+        return next(k for k in self.params.keys() if k.endswith(names))  # noqa: SIM118
+
+    def _set(self, name: str, leaf: mi.Float | mi.TensorXf) -> None:
+        """A parameter from its numbers, flat or as they are kept; attached if they are."""
+        now = self.params[self.key(name)]
+        self.params[self.key(name)] = leaf if type(leaf) is type(now) else type(now)(leaf, now.shape)
 
     def _sensor(self) -> dict:
         H, W = self.data.mask.shape
@@ -212,7 +212,7 @@ class Rendering:
             "weights": mi.TensorXf(own(guess.weights), guess.weights.shape),
         }
         if self.several:
-            self.params[self.key("vertex_base")] = own(guess.base[nearest])
+            self._set("vertex_base", own(guess.base[nearest]))
         self._put()
         if self.data.near:
             for k, s in enumerate(guess.exposures):
@@ -226,7 +226,7 @@ class Rendering:
     def _put(self) -> None:
         """Hand the leaves to the scene: the positions first, an update of which makes normals anew."""
         for name, leaf in self.leaves.items():
-            self.params[self.key(name)] = leaf
+            self._set(name, leaf)
             if name == "vertex_positions":
                 self.params.update()
         self.params.update()
@@ -305,7 +305,7 @@ class Rendering:
         P, K = lighting.P, lighting.K
         p = dr.arange(mi.UInt32, P)
         inner = dr.gather(mi.UInt32, mi.UInt32(self.domain.inner.astype(np.uint32)), p)
-        load = lambda kind, name: dr.gather(kind, self.params[self.key(name)], inner)
+        load = lambda kind, name: dr.gather(kind, self.leaves[name], inner)
         point, normal = load(mi.Point3f, "vertex_positions"), load(mi.Vector3f, "vertex_normals")
         pixel = 1.0 if self.data.camera is None else dr.abs(point.z) / float(self.data.camera[0, 0])
         origin = mi.Point3f(point + normal * (ABOVE * pixel))

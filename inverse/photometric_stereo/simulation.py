@@ -14,6 +14,7 @@ from scipy import ndimage
 from tqdm import tqdm
 
 from rimlight import ggx, no_collection
+from rimlight.edge_sampling.geometry.meshes import as_parameter, make_mesh, positions_key
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import write_exr
 from rimlight.leds import Led, emitters
@@ -21,9 +22,7 @@ from rimlight.loading import one_line
 
 from . import dataset
 from .dataset import Dataset, unit
-from .direct import own
 from .integration import mesh_of, normals_of
-from .output import make_mesh
 
 #: File of the true depth.
 TRUE_DEPTH = "Depth_gt.exr"
@@ -126,7 +125,8 @@ class HeightField:
         inside = np.isfinite(self.depth)
         vertices, faces, _ = mesh_of(self.depth, inside, pixel_size=1 / DETAIL)
         middle = (self.depth.shape[0] - 1) / 2 / DETAIL
-        mesh = make_mesh(vertices + np.array([-middle, middle, 0]) + offset, faces, self.normals[inside], bsdf)
+        place = vertices + np.array([-middle, middle, 0]) + offset
+        mesh = make_mesh("object", place, faces, normals=self.normals[inside], bsdf=bsdf)
         for name, values in (attributes or {}).items():
             mesh.add_attribute(name, 1, values[inside].astype(np.float32))
         return mesh
@@ -259,14 +259,15 @@ def _of_mesh(x: np.ndarray, y: np.ndarray, size: float, options: Options) -> Hei
         raise FileNotFoundError(f'ps: there is no file "{path}"')
     mesh = _load({"type": path.suffix[1:].lower(), "filename": str(path), "face_normals": True})
     params = mi.traverse(mesh)
-    vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3) @ _rotation(options.rotate).T
+    key = positions_key(params)
+    vertices = np.array(params[key], np.float64).reshape(-1, 3) @ _rotation(options.rotate).T
     if not mesh.face_count() or not np.isfinite(vertices).all():
         raise InputError(f'ps: "{path}" has no faces, or vertices that are not finite')
     low, extent = vertices.min(0), np.ptp(vertices, 0)
     left, bottom, right, top, back = options.crop
     first, last = low + extent * [left, bottom, back], low + extent * [right, top, 1]
     scale = size / (last - first)[:2].max()
-    params["vertex_positions"] = own((vertices - (first + last) / 2) * scale)
+    params[key] = as_parameter((vertices - (first + last) / 2) * scale, params[key])
     params.update()
     scene = mi.load_dict({"type": "scene", "mesh": mesh})
     far = float(scale * extent[2])

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import no_collection
-from rimlight.edge_sampling.geometry.meshes import is_positions_key
+from rimlight.edge_sampling.geometry.meshes import is_positions_key, present_key
 from rimlight.edge_sampling.refusals import InputError
 
 
@@ -45,6 +45,7 @@ class Motion:
         vertices: Sequence[int] | None = None,
     ):
         self.params = mi.traverse(scene)
+        key = present_key(self.params, key)
         if key not in self.params:
             close = difflib.get_close_matches(key, list(self.params.keys()), n=3, cutoff=0.4)
             raise InputError(f'unknown parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else ""))

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -32,6 +33,9 @@ RUNS, REFERENCE_SPP = 8, 8192
 #: Fewest and most calls of a method after the first.
 CALLS = 3, 64
 
+#: Rows of ours: at its defaults, and with `integrator.balance` before the first call, outside of the clock.
+OURS, BALANCED = "direct_edge", "direct_edge, balanced"
+
 #: Normal quantile of a confidence interval of 95 %.
 CONFIDENCE = 1.96
 
@@ -49,9 +53,10 @@ class Case:
     tuned: dict[str, Any]
 
     def methods(self) -> dict[str, dict[str, Any]]:
-        """Integrators by the names of their rows: ours, and Mitsuba's at its defaults and tuned."""
+        """Integrators by the names of their rows: ours and Mitsuba's, at their defaults and tuned."""
         return {
-            "direct_edge": {"type": "direct_edge"},
+            OURS: {"type": "direct_edge"},
+            BALANCED: {"type": "direct_edge"},
             "direct_projective": {"type": "direct_projective"},
             "direct_projective, tuned": {"type": "direct_projective", **self.tuned},
         }
@@ -102,7 +107,7 @@ class Bench:
     """JSON file to write, to share or to compare. The table is printed."""
     spp: int = 16
     """Samples per pixel of a derivative."""
-    seconds: float = 8
+    seconds: float = 6
     """Time for the calls of one method in one scene."""
 
     def run(self) -> int:
@@ -139,6 +144,8 @@ class Bench:
         with progress(list(case.methods().items()), case.scene) as bar:
             for name, options in bar:
                 integrator = mi.load_dict(options)
+                if name == BALANCED:
+                    balance(integrator, scene, motion, self.spp)
                 images, times = [], []
                 while len(times) < 1 + CALLS[0] or (sum(times[1:]) < self.seconds and len(times) <= CALLS[1]):
                     start = time.perf_counter()
@@ -147,6 +154,16 @@ class Bench:
                     times.append(time.perf_counter() - start)
                 rows.append(row(case.scene, name, options, np.array(images), times, reference))
         return rows
+
+
+def balance(integrator: Any, scene: mi.Scene, motion: Motion, spp: int) -> None:
+    """Divide the samples among the terms of a derivative along this motion."""
+    theta = mi.Float(0)
+    dr.enable_grad(theta)
+    motion.apply(theta)
+    dr.forward(theta, dr.ADFlag.ClearEdges)
+    integrator.balance(scene, motion.params, spp=spp)
+    motion.apply(0.0)
 
 
 def row(
@@ -193,7 +210,7 @@ def table(rows: list[Row]) -> list[str]:
         "efficiency",
     )
     lines = [f"| {' | '.join(columns)} |", f"|---|---|{'---:|' * (len(columns) - 2)}"]
-    ours = {r.scene: r.efficiency for r in rows if r.options["type"] == "direct_edge"}
+    ours = {r.scene: r.efficiency for r in rows if r.method == OURS}
     for r in rows:
         tuned = ", ".join(f"{k} {v}" for k, v in r.options.items() if k != "type")
         name = r.method + (f" ({tuned})" if tuned else "")

@@ -10,6 +10,7 @@ import pytest
 from rimlight.checks import Motion
 from rimlight.edge_sampling import Geometry, find_edges
 from rimlight.edge_sampling.geometry import meshes
+from rimlight.inverse import Free, free_parameters, smooth_mesh
 
 
 class Tensors:
@@ -143,6 +144,21 @@ def test_keys_of_positions(key, expected):
     assert meshes.is_positions_key(key) is expected
 
 
+@pytest.mark.parametrize(
+    ("key", "present", "expected"),
+    [
+        ("cube.vertex_positions", "cube.positions", "cube.positions"),
+        ("cube.positions", "cube.vertex_positions", "cube.vertex_positions"),
+        ("vertex_normals", "normals", "normals"),
+        ("cube.vertex_positions", "ball.positions", "cube.vertex_positions"),
+        ("cube.vertex_color", "cube.color", "cube.vertex_color"),
+        ("cube.positions", "cube.positions", "cube.positions"),
+    ],
+)
+def test_scenes_of_one_interface_name_the_parameters_of_the_other(key, present, expected):
+    assert meshes.present_key({present: None}, key) == expected
+
+
 def test_motions_of_tensors_are_those_of_flat_arrays(variant, monkeypatch):
     """`rimlight check` and its like: the same vertices move by the same vector."""
 
@@ -162,3 +178,101 @@ def test_motions_of_tensors_are_those_of_flat_arrays(variant, monkeypatch):
         moved[key] = np.array(motion.params[key]).reshape(4, 3)
     np.testing.assert_array_equal(*moved.values())
     np.testing.assert_array_equal((moved["a.positions"] != rows).any(1), [False, True, False, True])
+
+
+# ---------------------- Fits, and meshes that are made ----------------------
+
+
+class Parameters(dict):
+    """Those of one corner-sharing cube, as Mitsuba 3.10 names them, or 3.9."""
+
+    def __init__(self, new: bool):
+        mesh = mi.load_dict({"type": "cube"})
+        cube = Tensors(mesh)
+        if new:
+            super().__init__({"a.positions": cube.positions(), "a.faces": cube.faces()})
+            self["a.position_index"] = cube.position_index()
+        else:
+            super().__init__({"a.vertex_positions": mesh.vertex_positions_buffer(), "a.faces": mesh.faces_buffer()})
+
+
+def at_vertices(params: Parameters, value) -> np.ndarray:
+    """(V, 3), of a parameter of positions."""
+    rows = np.array(value).reshape(-1, 3)
+    return rows[np.array(params["a.position_index"])] if "a.position_index" in params else rows
+
+
+@pytest.mark.parametrize(
+    "how", [{"kind": "pose", "start": (0.1, 0, 0.2, 0, 30, 0)}, {"kind": "shape", "start": (0.1, 0, 0.2)}], ids=str
+)
+def test_fits_move_both_alike(variant, how):
+    """The same vertices to the same places, with the same gradients."""
+    found = []
+    for params in (Parameters(new=False), Parameters(new=True)):
+        key = meshes.positions_key(params)
+        (parameter,) = free_parameters.find([Free(key=(key,), **how)], params)
+        latents = {name: mi.Float(start) for name, start in parameter.start.items()}
+        dr.enable_grad(latents)
+        value = parameter.values(latents)[key]
+        assert type(value) is type(params[key])
+        assert dr.shape(value) == dr.shape(params[key])
+        points = meshes.points(value)
+        if "a.position_index" in params:
+            points = dr.gather(mi.Point3f, dr.ravel(points), params["a.position_index"])
+        dr.backward(dr.sum(dr.squared_norm(points)))
+        found.append((at_vertices(params, value), *(np.array(dr.grad(x)) for x in latents.values())))
+    for old, new in zip(*found, strict=True):
+        np.testing.assert_allclose(new, old, rtol=1e-4, atol=1e-5)
+
+
+def test_triangles_are_the_same(variant):
+    old, new = (
+        np.array(params[key]).reshape(-1, 3)[meshes.faces_of_positions(params, key)]
+        for params, key in ((Parameters(new=False), "a.vertex_positions"), (Parameters(new=True), "a.positions"))
+    )
+    np.testing.assert_array_equal(new, old)
+
+
+def test_smoothing_pulls_both_alike(variant):
+    params = Parameters(new=True)
+    key = "a.positions"
+    faces = meshes.faces_of_positions(params, key)
+    as_tensor = smooth_mesh(key, faces, 2.0)({key: params[key]})
+    as_flat = smooth_mesh(key, faces, 2.0)({key: params[key].array})
+    assert as_tensor[0] == as_flat[0] > 0
+
+
+def test_meshes_are_made_in_both(variant, monkeypatch):
+    """Vertices, normals and attributes arrive: in the mesh of this Mitsuba, and at the calls of 3.10's."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    faces = np.array([[0, 1, 2]])
+    normals = np.array([[0, 0.6, 0.8]] * 3)
+    colour = np.linspace(0, 1, 9).reshape(3, 3)
+    given = {"normals": normals, "attributes": {"vertex_color": colour}}
+    old = meshes.make_mesh("a", vertices, faces, bsdf=mi.load_dict({"type": "conductor"}), **given)
+    assert old.bsdf().class_name() == "SmoothConductor"
+    np.testing.assert_allclose(np.array(old.vertex_normals_buffer()).reshape(3, 3), normals, rtol=1e-6)
+    np.testing.assert_allclose(np.array(old.attribute_buffer("vertex_color")), colour.ravel(), rtol=1e-6)
+
+    class New:
+        def __init__(self, props):
+            self.name, self.made, self.attributes = props.id(), None, {}
+
+        def from_fields(self, faces, positions, normals):
+            self.fields = faces, positions, normals
+
+        def add_attribute(self, name, values):
+            self.attributes[name] = values
+
+        def recompute_normals(self):
+            self.made = True
+
+    monkeypatch.setattr(mi, "Mesh", New)
+    new = meshes.make_mesh("a", vertices, faces, **given)
+    assert (new.name, new.made) == ("a", None)
+    for tensor, expected in zip(
+        (*new.fields, *new.attributes.values()), (faces, vertices, normals, colour), strict=True
+    ):
+        assert tensor.shape == expected.shape
+        np.testing.assert_allclose(np.array(tensor), expected, rtol=1e-6)
+    assert meshes.make_mesh("a", vertices, faces).made

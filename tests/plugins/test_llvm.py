@@ -152,6 +152,18 @@ def test_failure_names_the_reasons_and_the_remedy() -> None:
         assert text in str(failure.value)
 
 
+def test_a_missing_libatomic_is_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The LLVM of the environment is there, in a container that lacks what it needs."""
+
+    def inspect(path: str) -> int:
+        raise ValueError("cannot be loaded (libatomic.so.1: cannot open shared object file)")
+
+    monkeypatch.setattr(_llvm, "inspect", inspect)
+    with pytest.raises(ImportError, match="apt install libatomic1") as failure:
+        _llvm.find(variables={}, environment=lambda: ["/env/libLLVM.so"], system=lambda: [])
+    assert "pip install" not in str(failure.value)
+
+
 def nothing_usable(monkeypatch: pytest.MonkeyPatch, backend: str | None) -> None:
     monkeypatch.setenv(_llvm.VARIABLE, "")
     monkeypatch.setattr(_llvm, "find", lambda: (_ for _ in ()).throw(ImportError("nothing; the remedy")))
