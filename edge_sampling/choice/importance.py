@@ -92,7 +92,7 @@ def edge_importance(slot: Slot, view: View) -> mi.Float:
     product = length_a * length_b
     across = dr.norm(dr.cross(a, b))
     # Twice the tangent of half the angle under which the edge is seen: near enough to the angle, but for large ones.
-    angle = dr.minimum(2 * across / (product + dr.dot(a, b)), dr.pi)
+    angle = dr.minimum(2 * across / dr.maximum(product + dr.dot(a, b), 0), dr.pi)
     cosine = dr.clip(0.5 * (above[0] / length_a + above[1] / length_b), 0, 1) + MARGIN
     result = view.wide * angle * dr.select(everywhere, 1, cosine)
     e = b - a

@@ -7,7 +7,7 @@ component of A·(u, v, 1) is whole, with a matrix A of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,9 @@ from .meshes import Geometry, has_place, has_texcoords, is_met, objects_below, p
 
 #: The texture that shows a volume on a surface.
 VOLUME = "VolumeAdapter"
+
+#: Points at which a volume is looked at for its brightest and its darkest voxel.
+PLACES = 2**20
 
 
 @dataclass(frozen=True)
@@ -209,35 +212,36 @@ def _colours(texture: mi.Texture) -> list[Any]:
 
 def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 256, steps: int = 22) -> bool:
     """Bisect segments towards their steeper half: where a texture is continuous, the difference dies out. They are
-    random, and that between the brightest texel and the darkest, since few may differ from all others.
+    random, and that between the brightest texel or voxel and the darkest, since few may differ from all others.
 
     lower, upper : of the texture coordinates; of volumes, which vary in space, of the scene.
     """
     in_space = len(lower) == 3
     ends = np.random.default_rng(0).uniform(lower, upper, (pairs, 2, len(lower)))
-    ends = ends if in_space else np.concatenate([ends, _brightest_and_darkest(texture)])
-    ends = ends.astype(np.float32)
     with dr.suspend_grad():
-        si = dr.zeros(mi.SurfaceInteraction3f, len(ends))
-        if mi.is_spectral:
-            si.wavelengths = type(si.wavelengths)(550)
 
         def value(at: mi.Point2f | mi.Point3f) -> mi.Spectrum:
+            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(at))
+            if mi.is_spectral:
+                si.wavelengths = type(si.wavelengths)(550)
             setattr(si, "p" if in_space else "uv", at)
             return texture.eval(si)
 
+        extremes = _brightest_and_darkest_in_space(texture, value) if in_space else _brightest_and_darkest(texture)
+        ends = np.concatenate([ends, extremes]).astype(np.float32)
         difference = lambda f, g: dr.max(dr.abs(f - g))
         p, q = ((mi.Point3f if in_space else mi.Point2f)(ends[:, k].T) for k in (0, 1))
         at_p, at_q = value(p), value(q)
         before = difference(at_p, at_q)
+        # Rounding makes differences, too, where a texture is constant.
+        least = dr.maximum(1e-3 * dr.max(before), 1e-5 * dr.max(difference(at_p, 0)))
         for _ in range(steps):
             middle = 0.5 * (p + q)
             at_middle = value(middle)
             left = difference(at_p, at_middle) > difference(at_middle, at_q)
             p, at_p = dr.select(left, p, middle), dr.select(left, at_p, at_middle)
             q, at_q = dr.select(left, middle, q), dr.select(left, at_middle, at_q)
-        # Rounding makes differences, too, where a texture is constant.
-        return bool(dr.any((before > 1e-3 * dr.max(before)) & (difference(at_p, at_q) > 0.3 * before)))
+        return bool(dr.any((before > least) & (difference(at_p, at_q) > 0.3 * before)))
 
 
 def _brightest_and_darkest(texture: mi.Texture) -> np.ndarray:
@@ -251,3 +255,14 @@ def _brightest_and_darkest(texture: mi.Texture) -> np.ndarray:
     places = np.stack([np.stack([u, w], -1) for w in (v, 1 - v)])
     to_uv = np.array(params["to_uv"].matrix, float)
     return (places - to_uv[:2, 2]) @ np.linalg.pinv(to_uv[:2, :2]).T
+
+
+def _brightest_and_darkest_in_space(texture: mi.Texture, value: Callable[[mi.Point3f], mi.Spectrum]) -> np.ndarray:
+    """Places of these two values of a volume, of many that are random: (1, 2, 3).
+
+    Where its voxels are, Mitsuba does not tell: a part that is smaller than one in as many is not found.
+    """
+    box = next(o for o in objects_below(texture).values() if isinstance(o, mi.Volume)).bbox()
+    places = np.random.default_rng(1).uniform(list(box.min), list(box.max), (PLACES, 3))
+    found = np.array(dr.sum(value(mi.Point3f(places.T.astype(np.float32)))))
+    return places[[[found.argmax(), found.argmin()]]]

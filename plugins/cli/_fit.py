@@ -103,7 +103,7 @@ class Fit:
                 )
                 found = (outcome for _, of_block in blocks for outcome in of_block)
             else:
-                found = (outcome for job in jobs for outcome in _whole(self.config.stem, None, [job]))
+                found = (outcome for job in jobs for outcome in _whole(self.config.stem, None, [job], progress=True))
             for seed, (code, lines) in zip(seeds, found, strict=True):
                 print("\n".join(f"seed {seed}: {line}" for line in lines), flush=True)
                 worst = max(worst, code)
@@ -112,11 +112,16 @@ class Fit:
         return worst
 
 
-def _whole(title: str, _: None, jobs: Sequence[tuple[Problem, Path]]) -> list[tuple[int, list[str]]]:
-    """Exit codes, and lines for people, of whole fits. What has begun, maybe on a worker that was lost, goes on."""
+def _whole(
+    title: str, _: None, jobs: Sequence[tuple[Problem, Path]], progress: bool = False
+) -> list[tuple[int, list[str]]]:
+    """Exit codes, and lines for people, of whole fits. What has begun, maybe on a worker that was lost, goes on.
+
+    progress : show a bar for each?
+    """
     outcomes = []
     for problem, out in jobs:
-        found = inverse.fit(problem, out=out, resume=(out / "checkpoint.npz").exists(), progress=False)
+        found = inverse.fit(problem, out=out, resume=(out / "checkpoint.npz").exists(), progress=progress)
         inverse.write(out, found, title=f"{title}, seed {problem.seed}")
         outcomes.append((_code(found), [*_said(found), f"report: {out / 'report.html'}"]))
     return outcomes

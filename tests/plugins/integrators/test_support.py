@@ -172,9 +172,10 @@ def signed_distances() -> dict:
     return {"type": "sdfgrid", "normals": "smooth", "grid": mi.TensorXf(d[..., None].astype(np.float32))}
 
 
-def volume(filter_type: str) -> dict:
-    """Colours in space."""
-    grid = mi.VolumeGrid(np.random.default_rng(0).uniform(0.1, 0.9, (4, 4, 4, 3)).astype(np.float32))
+def volume(filter_type: str, voxels: np.ndarray | None = None) -> dict:
+    """Colours in space. voxels : (Z, Y, X, 3); None: random ones."""
+    voxels = np.random.default_rng(0).uniform(0.1, 0.9, (4, 4, 4, 3)) if voxels is None else voxels
+    grid = mi.VolumeGrid(voxels.astype(np.float32))
     box = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2.2)
     of = {"type": "gridvolume", "grid": grid, "raw": True, "filter_type": filter_type, "to_world": box}
     return textured({"type": "volume", "volume": of})
@@ -1025,3 +1026,13 @@ def test_a_single_texel_jumps(filter_type):
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": filter_type, "to_uv": to_uv}
     scene = stage({"thing": sheet("thing", np.array([0, 0, 1]), {"type": "diffuse", "reflectance": texture})})
     assert bool(jumping_textures(scene)) == (filter_type == "nearest")
+
+
+@pytest.mark.parametrize("filter_type", ["nearest", "trilinear"])
+@pytest.mark.parametrize("other", [0.1, 0.5], ids=["one voxel differs", "all are alike"])
+def test_a_single_voxel_jumps(filter_type, other):
+    """Random segments know nothing of it; and rounding is no jump."""
+    voxels = np.full((16, 16, 16, 3), 0.5)
+    voxels[3, 9, 12] = other
+    scene = stage({"thing": sheet("thing", np.array([0, 0, 1]), volume(filter_type, voxels))})
+    assert bool(jumping_textures(scene)) == (filter_type == "nearest" and other != 0.5)
