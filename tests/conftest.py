@@ -7,6 +7,7 @@ import drjit as dr
 # isort: on
 
 import gc
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,6 +18,9 @@ import tiers
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared" / "data"
+
+#: `RIMLIGHT_TEST_VARIANT=cuda_ad_rgb make test` runs the tests on a GPU (docs/gpu.md).
+VARIANT = os.environ.get("RIMLIGHT_TEST_VARIANT", "llvm_ad_rgb")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -45,8 +49,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def variant() -> Iterator[str]:
     """The variant of all tests. A test that changes it sets it back."""
-    mi.set_variant("llvm_ad_rgb")
-    yield "llvm_ad_rgb"
+    mi.set_variant(VARIANT)
+    yield VARIANT
 
 
 #: Kernels that had been launched when memory was last freed.
@@ -63,6 +67,8 @@ def free_memory() -> Iterator[None]:
     global launched
     gc.freeze()
     yield
+    if mi.variant() != VARIANT:
+        mi.set_variant(VARIANT)
     launches, _, _ = dr.detail.launch_stats()
     if launches != launched:
         launched = launches

@@ -5,6 +5,7 @@ Mitsuba traces the same triangles for all instances; only the edges are there on
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,10 +21,12 @@ from .meshes import (
     has_normals,
     has_texcoords,
     is_flipped,
+    named_shape_groups,
     normals_of,
     number_of,
     positions_of,
     shape_groups,
+    tells_shapes_in_groups,
     texcoords_of,
 )
 
@@ -214,10 +217,19 @@ def _attach(si, to_world: mi.AffineTransform4f, ray, pi, flags, active) -> None:
 
 
 def _meshes_of(scene: mi.Scene, instances: list[Any]) -> list[MeshOfInstance]:
-    """The meshes of the instances. Reads from the device: Mitsuba does not tell of an instance which group it shows,
-    but what its first shape is."""
+    """The meshes of the instances. Reads from the device."""
     if not instances:
         return []
+    shown, found = (_named if tells_shapes_in_groups() else _first_met)(scene, instances), []
+    for instance, shapes in zip(instances, shown, strict=True):
+        if all(s.is_mesh() and s.class_name() != "EllipsoidsMesh" for s in shapes):
+            found += [MeshOfInstance(instance, mesh) for mesh in shapes]
+    return found
+
+
+def _first_met(scene: mi.Scene, instances: list[Any]) -> list[list[Any]]:
+    """The shapes of the instances. Mitsuba does not tell of an instance which group it shows, but what its first shape
+    is, to whom does not know it."""
     groups = {number_of(shapes[0]): shapes for shapes in shape_groups(scene) if shapes}
     with dr.suspend_grad():
         met = dr.zeros(mi.PreliminaryIntersection3f, len(instances))
@@ -227,9 +239,14 @@ def _meshes_of(scene: mi.Scene, instances: list[Any]) -> list[MeshOfInstance]:
         ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
         first = met.compute_surface_interaction(ray, mi.RayFlags.FollowShape).shape
         firsts = dr.reinterpret_array(mi.UInt32, first).numpy().tolist()
-    found = []
-    for instance, number in zip(instances, firsts, strict=True):
-        shapes = groups.get(number, [])
-        if all(s.is_mesh() and s.class_name() != "EllipsoidsMesh" for s in shapes):
-            found += [MeshOfInstance(instance, mesh) for mesh in shapes]
-    return found
+    return [groups.get(number, []) for number in firsts]
+
+
+def _named(scene: mi.Scene, instances: list[Any]) -> list[list[Any]]:
+    """The shapes of the instances; none where groups have the same name. An instance says the name of its group in
+    words only."""
+    groups = named_shape_groups(scene)
+    names = [name for name, _ in groups]
+    shapes = {name: inside for name, inside in groups if names.count(name) == 1}
+    shown = (re.search(r'ShapeGroup\[\s*name = "(.*)"', str(i)) for i in instances)
+    return [shapes.get(match[1], []) if match else [] for match in shown]

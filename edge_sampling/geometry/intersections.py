@@ -22,7 +22,7 @@ import numpy as np
 
 from .device_edges import rounding
 from .edges import WHOLE, EdgeKind, Edges, Weld
-from .meshes import Geometry, number_of, positions_of
+from .meshes import Geometry, number_of, positions_of, tells_shapes_in_groups
 from .rigid_motion import Shapes
 
 #: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
@@ -85,6 +85,7 @@ class Intersections:
         faces = geometry.faces((True,) * len(geometry.meshes))
         self._faces = [_index(faces[:, k]) for k in range(3)]
         self._first_mesh = _first_meshes(geometry)
+        self._in_group = _numbers_in_groups(geometry) if tells_shapes_in_groups() else None
         counts = [m.face_count() for m in geometry.meshes]
         self._first_face = _index(np.cumsum([0, *counts]))
         self._meshes = len(counts)
@@ -196,12 +197,15 @@ class Intersections:
             ray.maxt = length - t
             pi = scene.ray_intersect_preliminary(ray, active=active)
             active &= pi.is_valid()
-            # In a shape group, Mitsuba numbers the shapes from 0.
+            # In a shape group, Mitsuba numbers the shapes from 0, or tells the shape itself.
             shape, instance = (dr.reinterpret_array(mi.UInt32, s) for s in (pi.shape, pi.instance))
             number = dr.select(instance != 0, instance, shape)
             mesh = dr.gather(mi.UInt32, self._first_mesh, number, active & (number < dr.width(self._first_mesh)))
             is_mesh = active & (mesh > 0)
-            mesh = dr.select(is_mesh, mesh - 1 + dr.select(instance != 0, pi.shape_index, 0), 0)
+            which = pi.shape_index
+            if self._in_group is not None:
+                which = dr.gather(mi.UInt32, self._in_group, shape, is_mesh & (instance != 0))
+            mesh = dr.select(is_mesh, mesh - 1 + dr.select(instance != 0, which, 0), 0)
             face = dr.select(is_mesh, dr.gather(mi.UInt32, self._first_face, mesh) + pi.prim_index, 0)
             vertices = [dr.gather(mi.UInt32, corner, face, is_mesh) for corner in self._faces]
             places = [dr.gather(mi.UInt32, self._place, v, is_mesh) for v in vertices]
@@ -392,6 +396,16 @@ def _first_meshes(geometry: Geometry) -> mi.UInt32:
     numbers = [number_of(getattr(m, "instance", m)) for m in geometry.meshes]
     table = np.zeros(max(numbers, default=0) + 1, np.uint32)
     table[numbers[::-1]] = np.arange(len(numbers), 0, -1)
+    return mi.UInt32(table)
+
+
+def _numbers_in_groups(geometry: Geometry) -> mi.UInt32:
+    """By the number that Dr.Jit gives to a shape in a group: which of the meshes of its group it is."""
+    inner = [(id(m.instance), number_of(m.inner)) for m in geometry.meshes if hasattr(m, "instance")]
+    table = np.zeros(max((number for _, number in inner), default=0) + 1, np.uint32)
+    seen: dict[int, int] = {}
+    for instance, number in inner:
+        table[number] = seen[instance] = seen.get(instance, -1) + 1
     return mi.UInt32(table)
 
 

@@ -397,8 +397,19 @@ def surfaces(scene: mi.Scene) -> list[Any]:
 
 def shape_groups(scene: mi.Scene) -> list[list[Any]]:
     """The shapes in each shape group of a scene."""
+    return [shapes for _, shapes in named_shape_groups(scene)]
+
+
+def named_shape_groups(scene: mi.Scene) -> list[tuple[str, list[Any]]]:
+    """The identifier of each shape group of a scene, and the shapes in it."""
     groups = [o for o in objects_below(scene).values() if o.class_name() == "ShapeGroupPlugin"]
-    return [[s for s in objects_below(g).values() if isinstance(s, mi.Shape) and s is not g] for g in groups]
+    inside = lambda g: [s for s in objects_below(g).values() if isinstance(s, mi.Shape) and s is not g]
+    return [(g.id(), inside(g)) for g in groups]
+
+
+def tells_shapes_in_groups() -> bool:
+    """Does Mitsuba tell which shape of a group a ray meets, as on GPUs, or its number in the group only?"""
+    return mi.variant().startswith(("cuda", "metal"))
 
 
 def objects_below(root: mi.Object) -> dict[str, Any]:

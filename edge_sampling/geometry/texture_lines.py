@@ -22,6 +22,9 @@ from .meshes import Geometry, has_place, has_texcoords, is_met, objects_below, p
 #: The texture that shows a volume on a surface.
 VOLUME = "VolumeAdapter"
 
+#: Texture units of GPUs know places between texels in steps of this size (documentation of `drjit.cuda.Texture2f`).
+TEXTURE_UNIT_STEP = 1 / 256
+
 #: Points at which a volume is looked at for its brightest and its darkest voxel.
 PLACES = 2**20
 
@@ -32,10 +35,12 @@ class Lattice:
 
     matrix : A, (2, 3).
     light : whose texture it is; None: it is one of a shape.
+    step : so far from its lines, in texels, what belongs to one side may be found on the other.
     """
 
     matrix: np.ndarray
     light: mi.Emitter | None = None
+    step: float = 0.0
 
     @property
     def size(self) -> float:
@@ -71,17 +76,18 @@ class TextureLines:
     lit : shapes on which these count; None: on all.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("_sizes",))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("_sizes", "_steps"))  # for `dr.freeze`
 
     def __init__(self, shapes: Sequence[Any], lights: Sequence[mi.Emitter] = (), lit: Sequence[Any] | None = None):
         # Of each shape, lattices last, since the last line counts where several are found: the slopes of bump maps jump
         # there, and so may whether they turn away.
-        of_shapes = [(s, [*mapped_horizons(s), *(Lattice(m) for m in _matrices(s))]) for s in shapes]
+        of_shapes = [(s, [*mapped_horizons(s), *_lattices(s)]) for s in shapes]
         # The border of a beam counts where the texture of the light jumps as well.
         of_lights = [kind for light in lights for kind in lines_of_beam(light)]
         self.kinds = [kind for _, kinds in of_shapes for kind in kinds] + of_lights
         #: The largest value of each function where the texture coordinates are at most 1.
         self._sizes = mi.Float([k.size for k in self.kinds] or [1])
+        self._steps = mi.Float([getattr(k, "step", 0.0) for k in self.kinds] or [0])
         numbers = iter(range(len(self.kinds)))
         #: Shapes, and the numbers of their functions.
         self._shapes = [(s, [next(numbers) for _ in kinds]) for s, kinds in of_shapes if kinds]
@@ -122,6 +128,10 @@ class TextureLines:
         size = dr.gather(mi.Float, self._sizes, line.kind)
         return dr.epsilon(mi.Float) * dr.maximum(size, dr.abs(dr.detach(self.across(line, si))))
 
+    def step(self, line: Line) -> mi.Float:
+        """So far from a line, in units of its function, what belongs to one side may be found on the other."""
+        return dr.gather(mi.Float, self._steps, line.kind)
+
     def _of(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.UInt32, mi.Bool]]:
         """The functions of a point, one after the other: their numbers, and whether its shape has so many."""
         for k in range(max((len(numbers) for _, numbers in self._shapes), default=0)):
@@ -149,10 +159,10 @@ def _is_one_of(si: mi.SurfaceInteraction3f, shapes: Sequence[Any]) -> mi.Bool:
 def lines_of_beam(light: mi.Emitter) -> list[Any]:
     """Where the light of a spot or a projector jumps."""
     border = [BeamBorder(light)] if has_hard_beam(light) else []
-    return [*(Lattice(m, light) for m in _matrices(light)), *border] if light.class_name() in BEAMS else []
+    return [*_lattices(light, light), *border] if light.class_name() in BEAMS else []
 
 
-def _matrices(shape: Any) -> list[np.ndarray]:
+def _lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
     """Of the textures of a shape, or of a light, that jump."""
     of_mesh = isinstance(shape, mi.Mesh) and has_texcoords(shape)
     uv = np.concatenate([[[0, 0], [1, 1]], texture_coordinates(shape) if of_mesh else np.zeros((0, 2))])
@@ -166,9 +176,11 @@ def _matrices(shape: Any) -> list[np.ndarray]:
         size = np.array(o.resolution() if o.class_name().startswith("Bitmap") else (2, 2), float)
         matrix = size[:, None] * to_uv
         if any(o is t for t in bumps):
-            found.append(matrix - [[0, 0, 0.5], [0, 0, 0.5]])  # slopes jump in the middle of texels
+            # Slopes jump in the middle of texels. GPUs may take a place close to it for one on the other side.
+            step = 0.0 if mi.variant().startswith("llvm") else TEXTURE_UNIT_STEP
+            found.append(Lattice(matrix - [[0, 0, 0.5], [0, 0, 0.5]], light, step))
         elif _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()):
-            found.append(matrix)
+            found.append(Lattice(matrix, light))
     return found
 
 

@@ -208,7 +208,8 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
     if chains.textures is not None:
         line, along, _ = _at_line(chains.textures, at)
         si = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, at.found & at.on_texture)
-        aside = dr.select(at.on_texture, BESIDE_TEXTURE * chains.textures.rounding(line, si) / dr.abs(along), aside)
+        texels = dr.maximum(BESIDE_TEXTURE * chains.textures.rounding(line, si), chains.textures.step(line))
+        aside = dr.select(at.on_texture, texels / dr.abs(along), aside)
     wanted = at.found & (aside > 0) & (aside < LONGEST)
     aside = dr.select(wanted, aside, 0)
     wide = segment.widened(aside)

@@ -14,6 +14,11 @@ from both_modes import assert_backward_is_forward
 from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, derivative_image
+from rimlight.edge_sampling.geometry.instances import Instances
+from rimlight.edge_sampling.geometry.instances import _first_met as found_by_first_shape
+from rimlight.edge_sampling.geometry.instances import _named as found_by_name
+from rimlight.edge_sampling.geometry.intersections import _numbers_in_groups as numbers_in_groups
+from rimlight.edge_sampling.geometry.meshes import number_of
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 3}}
 
@@ -104,3 +109,31 @@ def test_jumps_inside_of_faces_are_refused(bsdf):
     scene = building.scene(sensor=building.camera(), group=group, thing=thing, **instances.room())
     with pytest.raises(RuntimeError, match='instances "thing" move, and are mirrors'):
         forward(scene, mi.load_dict(INTEGRATORS["direct_edge"]), 1, key="thing.to_world", direction=[1, 0, 0])
+
+
+# ---------------------- On GPUs ----------------------
+
+
+def two_groups() -> mi.Scene:
+    """Instances of two groups, in turn."""
+    cube = lambda name: building.mesh(name, 0.2 * building.cube_vertices(), building.CUBE_FACES)
+    shapes = {g: {"type": "shapegroup", f"in_{g}": cube(f"in_{g}")} for g in ("left", "right")}
+    for k in range(4):
+        shapes[f"box{k}"] = {"type": "instance", "group": {"type": "ref", "id": ("left", "right")[k % 2]}}
+    return building.scene(sensor=building.camera(), sky=building.constant(), **shapes)
+
+
+@pytest.mark.parametrize("make", [instances.boxes, two_groups])
+def test_names_of_groups_tell_their_shapes(make):
+    """Where Mitsuba does not tell the first shape of an instance, its description tells the group."""
+    scene = make()
+    shown = [s for s in scene.shapes() if s.class_name() == "Instance"]
+    ids = lambda found: [[s.id() for s in shapes] for shapes in found]
+    assert ids(found_by_name(scene, shown)) == ids(found_by_first_shape(scene, shown))
+    assert all(found_by_name(scene, shown))
+
+
+def test_number_of_a_shape_in_its_group():
+    geometry = Instances().geometry(instances.boxes())
+    numbers = numbers_in_groups(geometry).numpy()
+    assert [numbers[number_of(m.inner)] for m in geometry.meshes if hasattr(m, "inner")] == [0, 1] * 3
