@@ -103,6 +103,7 @@ test_coarse_meshes.py::test_agrees_with_finite_differences[camera]
 test_coarse_meshes.py::test_agrees_with_finite_differences[indirect]
 test_coarse_meshes.py::test_agrees_with_finite_differences[normal map]
 test_coarse_meshes.py::test_backward
+test_convergence.py::test_error_falls_with_samples[bunny_box]
 test_convergence.py::test_error_falls_with_samples[coloured_cube_camera]
 test_convergence.py::test_error_falls_with_samples[cornell_box_camera]
 test_convergence.py::test_error_falls_with_samples[corner_dolly]

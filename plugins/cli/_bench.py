@@ -109,13 +109,15 @@ class Bench:
     """Samples per pixel of a derivative."""
     seconds: float = 6
     """Time for the calls of one method in one scene."""
+    variant: str = "llvm_ad_rgb"
+    """Variant of Mitsuba."""
 
     def run(self) -> int:
         at_least(1, spp=self.spp)
         if not self.seconds > 0:
             raise InputError(f"--seconds must be > 0, got {self.seconds:g}")
         _loading.check_output(self.out, folder=False)
-        use_variant("llvm_ad_rgb")
+        use_variant(self.variant)
         level = mi.log_level()
         mi.set_log_level(mi.LogLevel.Error)  # the warnings of the peers are not about this table
         try:
@@ -126,7 +128,13 @@ class Bench:
         facts = {
             "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
             "machine": sys_info(),
-            "settings": {"spp": self.spp, "res": RES, "runs": RUNS, "reference_spp": REFERENCE_SPP},
+            "settings": {
+                "variant": self.variant,
+                "spp": self.spp,
+                "res": RES,
+                "runs": RUNS,
+                "reference_spp": REFERENCE_SPP,
+            },
             "rows": [asdict(row) for row in rows],
         }
         _loading.make_folder(self.out.parent)

@@ -49,7 +49,7 @@ class LightByLight(Scattering):
             turned = sample + mi.Point2f(TURN) * mi.Float(light)
             point = dr.minimum(turned - dr.floor(turned), dr.one_minus_epsilon(mi.Float))
         towards_light = lambda active: self.lights.sample_direction(self.scene, light, si, point, active)
-        L = self.reflect(si, bsdf, towards_light, active)
+        L = self.reflect(si, bsdf, towards_light, active, self.directions_of(si, bsdf, active))
         with dr.resume_grad(when=self.attached):
             return L if self.count == len(self.lights) else L * (len(self.lights) / self.count)
 
@@ -222,7 +222,9 @@ class LightPaths:
         """The next vertex, and what it emits."""
         si = place.surface(scattering, active)
         numbers = Numbers(mi.Point2f(0), sampler.next_1d(active), sampler.next_2d(active))
-        emitted, onwards = scattering.sample_bsdf(si, si.bsdf(place.ray), numbers, active)
+        bsdf = si.bsdf(place.ray)
+        directions = scattering.directions_of(si, bsdf, active)
+        emitted, onwards = scattering.sample_bsdf(si, bsdf, numbers, active, directions=directions)
         light = None
         if scattering.any_hit_by_rays:
             y = onwards.pi.compute_surface_interaction(onwards.ray, mi.RayFlags.Minimal, active)

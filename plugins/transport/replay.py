@@ -192,7 +192,9 @@ class Replay:
         def bounce(last, vertex, active, sampler):
             si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
             numbers = scattering.draw(sampler, active)
-            _, onwards = next_vertex(scene, si, si.bsdf(vertex.ray), numbers, active, self.chain.vicinity)
+            bsdf = si.bsdf(vertex.ray)
+            there = scattering.directions_of(si, bsdf, active)
+            _, onwards = next_vertex(scene, si, bsdf, numbers, active, self.chain.vicinity, directions=there)
             if log is not None:
                 log.leave(vertex.depth, vertex.β, numbers, active)
                 log.arrive(vertex.depth + 1, onwards, active)

@@ -14,6 +14,8 @@ from rimlight.edge_sampling.geometry.meshes import objects_below, surfaces
 from rimlight.edge_sampling.parametrisation import Connection, Parametrisation, Vicinity, shown_by_mirror
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to_light
 
+from .matt import MattDirections, turning
+
 
 @dataclass
 class Next:
@@ -82,6 +84,8 @@ class Scattering:
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in bsdfs)
+        #: Shapes whose normals may turn.
+        self.turning = turning(scene) if attached else []
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Numbers:
         light = sampler.next_2d(active) if self.any else mi.Point2f(0)
@@ -95,20 +99,25 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
-        directions: Directions | None = None,
+        directions: Directions | MattDirections | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Direct illumination that `si` reflects, and the next vertex.
 
         vicinity : in which that slides; None: it is a material point.
         met : what the ray to it meets, if that is known.
         directions : where it is active, directions are sampled from there, and only what comes from a lune is found.
-            Only where no gradients are carried.
+            None: as `directions_of` has it.
         """
+        directions = self.directions_of(si, bsdf, active) if directions is None else directions
         chosen = self._choose(si, numbers, active)
         from_emitter = self.sample_emitter(si, bsdf, numbers.light, active, directions, chosen) if self.any else 0
         from_bsdf, onwards = self.sample_bsdf(si, bsdf, numbers, active, vicinity, met, directions, chosen)
         with dr.resume_grad(when=self.attached):
             return from_bsdf + from_emitter, onwards
+
+    def directions_of(self, si, bsdf: mi.BSDFPtr, active: mi.Bool) -> MattDirections | None:
+        """In which directions to go on from surfaces, for a derivative. None: in those that the BSDF samples."""
+        return MattDirections.above(si, bsdf, self.turning, active) if self.turning else None
 
     def _choose(self, si, numbers: Numbers, active) -> ChosenLight | None:
         """The light of a light sample; None: it is Mitsuba that chooses."""
@@ -124,7 +133,7 @@ class Scattering:
         bsdf,
         sample: mi.Point2f,
         active,
-        directions: Directions | None = None,
+        directions: Directions | MattDirections | None = None,
         chosen: ChosenLight | None = None,
     ):
         """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). directions : see `scatter`. chosen : which
@@ -139,7 +148,7 @@ class Scattering:
 
         return self.reflect(si, bsdf, towards_light, active, directions)
 
-    def reflect(self, si, bsdf, towards_light, active, directions: Directions | None = None):
+    def reflect(self, si, bsdf, towards_light, active, directions: Directions | MattDirections | None = None):
         """Radiance reflected at `si` by what `towards_light` samples: mi.Spectrum, (N,).
 
         towards_light : maps `active` to a direction and the light from there over its density, as Mitsuba's
@@ -220,7 +229,7 @@ class Scattering:
         active: mi.Bool,
         vicinity: Vicinity | None = None,
         met: mi.PreliminaryIntersection3f | None = None,
-        directions: Directions | None = None,
+        directions: Directions | MattDirections | None = None,
         chosen: ChosenLight | None = None,
     ) -> tuple[mi.Spectrum, Next]:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
@@ -256,8 +265,9 @@ class Scattering:
         with dr.resume_grad(when=self.attached):
             mis = power_heuristic(bs.pdf, pdf)
             if len(self.held.smooth_lamps) and self.attached:
-                bsdf_pdf = bsdf.pdf(context, si, si.to_local(ω), active & ~mirrored)
-                mis = to_y.attach(mis, bsdf_pdf, pdf, by_light=False)
+                p = bsdf.pdf(context, si, si.to_local(ω), active & ~mirrored)
+                p = dr.select(directions.active, directions.pdf(ω), p) if directions is not None else p
+                mis = to_y.attach(mis, p, pdf, by_light=False)
             mis = dr.select(mirrored, 1, mis)
             Le = dr.select(active, weight * self._emission(emitter, y, mirrored, active) * mis, 0)
         return Le, onwards
@@ -366,7 +376,7 @@ def next_vertex(
     active: mi.Bool,
     vicinity: Vicinity | None = None,
     met: mi.PreliminaryIntersection3f | None = None,
-    directions: Directions | None = None,
+    directions: Directions | MattDirections | None = None,
 ) -> tuple[mi.BSDFSample3f, Next]:
     """A direction sampled from the BSDF, and the vertex there. Detached.
 

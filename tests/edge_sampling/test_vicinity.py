@@ -99,7 +99,7 @@ def test_any_radius_gives_the_same_derivative(monkeypatch):
     images = []
     for radius in (0, 1000):
         monkeypatch.setattr(parametrisation, "VICINITY", radius)
-        images.append(np.array([derivative_image(room, integrator, motion, spp=64, seed=i) for i in range(12)], float))
+        images.append(np.array([derivative_image(room, integrator, motion, spp=64, seed=i) for i in range(16)], float))
     both = sum(i.mean(0) for i in images) / 2
     scales = [(i * both).sum((1, 2, 3)) / (both**2).sum() for i in images]
     error = sum(s.var(ddof=1) / len(s) for s in scales) ** 0.5
