@@ -128,15 +128,17 @@ def compare(derivatives: np.ndarray, reference: FiniteDifferences, *, tolerance:
     g, g_error = mean_and_error(runs)
 
     # ---------------------- Projection ----------------------
+    # The channels of a pixel have the same random numbers: their errors are taken for one.
+    together = lambda errors: float((np.abs(errors).sum(2) ** 2).sum())
     # ⟨r, r⟩ without the noise of r, which would make the reference look larger than it is.
     size = float((r**2 - r_error**2).sum())
-    size_error = np.sqrt(float((4 * r**2 * r_error**2 + 2 * r_error**4).sum()))
+    size_error = np.sqrt(together(2 * r * r_error) + 2 * together(r_error**2))
     zero = size <= 3 * size_error
     projections = (runs * r).sum((1, 2, 3))
     scale = float(projections.mean() / size) if not zero else np.nan
     # Of few runs, the spread is uncertain; that of their pixels, of which there are many, is not.
-    own = max(projections.var(ddof=1) / len(runs), float((r**2 * g_error**2).sum()))
-    theirs = float((((g - 2 * r) * r_error) ** 2).sum())
+    own = max(projections.var(ddof=1) / len(runs), together(r * g_error))
+    theirs = together((g - 2 * r) * r_error)
     scale_error = float(np.sqrt(own + theirs) / size) if not zero else np.nan
 
     # ---------------------- Pixels, and squares of them ----------------------

@@ -59,6 +59,20 @@ def test_a_noisy_reference_does_not_look_larger():
     assert abs(scales.mean() - 1) < 4 * errors.mean() / np.sqrt(20)
 
 
+def test_channels_that_share_their_noise_do_not_count_as_independent():
+    """As in every render of the reference: the standard error of the scale is that of the scales."""
+    mean = np.abs(truth().mean(2, keepdims=True)) * np.array([1.0, 0.9, 0.8])
+    scales, errors = [], []
+    for seed in range(200):
+        noise = np.random.default_rng(seed).normal(size=(2, RUNS, 32, 32, 1))
+        differences = mean + 0.3 * noise[0]
+        r = FiniteDifferences(differences.mean(0), differences.std(0, ddof=1) / np.sqrt(RUNS), 0 * mean, {})
+        found = compare(mean + 0.01 * noise[1], r)
+        scales.append(found.scale)
+        errors.append(found.scale_error)
+    assert np.std(scales, ddof=1) == pytest.approx(np.mean(errors), rel=0.2)
+
+
 @pytest.mark.parametrize("factor", [0.98, 1.02, 0.0, -1.0])
 def test_a_factor_shows(factor):
     assert "scale" in agreement(factor * truth()).faults()[0]
