@@ -257,8 +257,8 @@ MUTANTS = [
     mutant(
         "lines of textures: looked at as closely as they are found",
         "plugins/terms/bisection.py",
-        "aside = dr.select(at.on_texture, BESIDE_TEXTURE",
-        "aside = dr.select(at.on_texture, 0 * BESIDE_TEXTURE",
+        "texels = dr.maximum(BESIDE_TEXTURE *",
+        "texels = dr.maximum(0 * BESIDE_TEXTURE *",
     ),
     mutant(
         "lines of textures: the border of a projector's picture stands still when its light turns",
