@@ -228,8 +228,8 @@ def _meshes_of(scene: mi.Scene, instances: list[Any]) -> list[MeshOfInstance]:
 
 
 def _first_met(scene: mi.Scene, instances: list[Any]) -> list[list[Any]]:
-    """The shapes of the instances. Mitsuba does not tell of an instance which group it shows, but what its first shape
-    is, to whom does not know it."""
+    """The shapes of the instances. Mitsuba does not tell of an instance which group it shows. But where an intersection
+    names the instance and the number 0 alone, its surface is of the group's first shape."""
     groups = {number_of(shapes[0]): shapes for shapes in shape_groups(scene) if shapes}
     with dr.suspend_grad():
         met = dr.zeros(mi.PreliminaryIntersection3f, len(instances))
@@ -243,8 +243,9 @@ def _first_met(scene: mi.Scene, instances: list[Any]) -> list[list[Any]]:
 
 
 def _named(scene: mi.Scene, instances: list[Any]) -> list[list[Any]]:
-    """The shapes of the instances; none where groups have the same name. An instance says the name of its group in
-    words only."""
+    """The shapes of the instances; none where groups have the same name, so that the instance counts as a shape of
+    unknown outlines. Where Mitsuba tells the shape in a group itself, `_first_met` cannot ask for it, and only the
+    description of an instance names its group."""
     groups = named_shape_groups(scene)
     names = [name for name, _ in groups]
     shapes = {name: inside for name, inside in groups if names.count(name) == 1}

@@ -84,7 +84,7 @@ class Scattering:
         #: Does it matter from where a surface is looked at?
         self.directional = any(f & (mi.BSDFFlags.Delta | mi.BSDFFlags.Glossy) for f in bsdfs)
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in bsdfs)
-        #: Shapes whose normals may turn.
+        #: Shapes at whose points the cosine of a direction may change where it is 0.
         self.turning = turning(scene) if attached else []
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Numbers:
