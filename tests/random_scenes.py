@@ -64,6 +64,9 @@ MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 #: A projection whose standard error is above this tells nothing: more samples are taken.
 TELLING = 0.03
 
+#: A gradient of backward mode is the derivative of forward mode, weighted, within this of its sum of absolute values.
+BACKWARD = 1e-3
+
 
 # ---------------------- Shapes ----------------------
 
@@ -652,6 +655,8 @@ class Comparison:
     relative, noise : Σ|g − ref| / Σ|ref|, and what of it noise explains.
     largest : difference of the sums over a square of pixels, in standard errors, beyond what is tolerated; the largest.
     size : Σ|ref|.
+    backward : difference of a gradient of backward mode from the derivative of forward mode, weighted by random
+        numbers; relative to the sum of absolute values of the latter.
     finite : is every number of the derivative?
     """
 
@@ -663,6 +668,7 @@ class Comparison:
     noise: float = math.nan
     largest: float = math.nan
     size: float = 0.0
+    backward: float = 0.0
     finite: bool = True
     seconds: float = 0.0
     stage: int = 0
@@ -670,7 +676,7 @@ class Comparison:
 
     @property
     def agrees(self) -> bool:
-        if self.raised or not self.finite:
+        if self.raised or not self.finite or not self.backward <= BACKWARD:
             return False
         if self.size == 0:
             return self.relative == 0  # nothing is seen to change
@@ -678,10 +684,25 @@ class Comparison:
         whole = abs(self.scale - 1) <= TOLERANCE + ERRORS * self.error and self.relative <= 0.04 + 1.3 * self.noise
         return whole and self.largest <= LARGEST
 
+    @property
+    def refused(self) -> bool:
+        """Does Rimlight say that it has no derivative of this scene?"""
+        return self.raised.startswith("Refusal")
+
     def __str__(self) -> str:
-        verdict = "ERR" if self.raised else "ok " if self.agrees else "BAD" if self.finite else "NAN"
+        verdict = (
+            "REF"
+            if self.refused
+            else "ERR"
+            if self.raised
+            else "ok "
+            if self.agrees
+            else "BAD"
+            if self.finite
+            else "NAN"
+        )
         numbers = f"scale {self.scale:.3f}+-{self.error:.3f} L1 {self.relative:.3f} noise {self.noise:.3f}"
-        numbers += f" z {self.largest:4.1f} |ref| {self.size:9.3g} {self.seconds:5.1f} s  "
+        numbers += f" z {self.largest:4.1f} |ref| {self.size:9.3g} back {self.backward:.0e} {self.seconds:5.1f} s  "
         return f"{self.seed:6d} {verdict} {self.stage} " + (self.raised if self.raised else numbers) + " " + self.label
 
 
@@ -732,27 +753,35 @@ def _squares(images: np.ndarray) -> np.ndarray:
     return sums
 
 
-def compare(seed: int, stages: tuple[tuple[int, int], ...] = STAGES, special: str = "") -> Comparison:
+def compare(
+    seed: int, stages: tuple[tuple[int, int], ...] = STAGES, special: str = "", integrator: str = ""
+) -> Comparison:
     """Compare a scene's derivative with finite differences, with more samples until the answer is clear.
+
+    integrator : tested instead of the scene's own, with paths as long.
 
     Scenes that do not agree in the end are compared once more, over a tenth of the step: a lamp that comes into the
     frame within a step, say, is no part of the derivative.
     """
-    row = _compare(seed, stages, STEP, special)
+    row = _compare(seed, stages, STEP, special, integrator)
     if row.agrees or row.raised or not row.finite or len(stages) < len(STAGES):
         return row
-    again = _compare(seed, stages[-1:], STEP / 10, special)
+    again = _compare(seed, stages[-1:], STEP / 10, special, integrator)
     again.seconds += row.seconds
     return again if again.agrees and again.error < 0.1 else row
 
 
-def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, special: str) -> Comparison:
+def _compare(
+    seed: int, stages: tuple[tuple[int, int], ...], step: float, special: str, integrator_type: str
+) -> Comparison:
     start, row = time.time(), Comparison(seed, "")
     try:
         # Finite differences at the origin, where rays start close to surfaces, and single precision tells most.
         still, moving = make(seed, "multijitter", home=True, special=special), make(seed, special=special)
         row.label = still.label
         path = mi.load_dict({"type": "path", "max_depth": still.max_depth, "rr_depth": 1000})
+        if integrator_type:
+            moving.integrator = {"type": integrator_type, "max_depth": moving.max_depth}
         integrator = mi.load_dict(moving.integrator)
         reference, derivative = [], []
         for row.stage, (references, derivatives) in enumerate(stages):
@@ -774,6 +803,8 @@ def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, specia
                 seed = 1000 + len(derivative)
                 image = integrator.render_forward(moving.scene, moving.params, seed=seed, spp=SPP)
                 derivative.append(np.array(image, np.float64))
+                if len(derivative) == 1:
+                    row.backward = _backward(moving, integrator, seed, derivative[0])
             rounding = ROUNDING * np.abs(images[0]) / (math.sqrt(2) * step)
             statistics(np.array(reference), np.array(derivative), row, rounding)
             if not row.finite or (row.agrees and (row.stage or not row.error > TELLING)):
@@ -782,6 +813,17 @@ def _compare(seed: int, stages: tuple[tuple[int, int], ...], step: float, specia
         row.raised = f"{type(error).__name__}: {str(error).strip().splitlines()[-1][:160]}"
     row.seconds = time.time() - start
     return row
+
+
+def _backward(moving: RandomScene, integrator: mi.Integrator, seed: int, forward: np.ndarray) -> float:
+    """How much does the gradient of backward mode differ from forward mode, with the same random numbers?"""
+    weight = np.random.default_rng(seed).uniform(0.5, 1, forward.shape)
+    θ = dr.opaque(mi.Float, 0)
+    dr.enable_grad(θ)
+    moving.move(θ)
+    integrator.render_backward(moving.scene, moving.params, mi.TensorXf(weight.astype(np.float32)), seed=seed, spp=SPP)
+    size = float(np.abs(weight * forward).sum())
+    return abs(float(dr.grad(θ)[0]) - float((weight * forward).sum())) / size if size else 0.0
 
 
 def main() -> None:
@@ -793,10 +835,12 @@ def main() -> None:
     parser.add_argument(
         "--special", choices=SPECIAL, default="", help="; ".join(f"{k}: {v}" for k, v in SPECIAL.items())
     )
+    parser.add_argument("--integrator", default="", help="tested instead of each scene's own: bdpt_edge, say")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba: llvm_ad_spectral, say")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, help="rows as JSON, one a line; seeds that it has are not repeated")
     args = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(args.variant)
     mi.set_log_level(mi.LogLevel.Error)
     seeds = list(args.only or range(*args.seeds))
     if args.out and args.out.exists():
@@ -806,22 +850,26 @@ def main() -> None:
         flags = (("--quick", args.quick), ("--thorough", args.thorough))
         options = [o for o, given in flags if given]
         options += ["--special", args.special] if args.special else []
+        options += ["--integrator", args.integrator] if args.integrator else []
+        options += ["--variant", args.variant]
         options += ["--out", str(args.out)] if args.out else []
         parts = [seeds[k :: args.processes] for k in range(args.processes)]
         command = [sys.executable, __file__, *options, "--only"]
         running = [subprocess.Popen([*command, *map(str, part)]) for part in parts if part]
         sys.exit(max(p.wait() for p in running))
     stages = STAGES[:1] if args.quick else STAGES[-1:] if args.thorough else STAGES
-    bad = []
+    bad, refused = [], []
     for seed in seeds:
-        row = compare(seed, stages, args.special)
+        row = compare(seed, stages, args.special, args.integrator)
         print(row, flush=True)
-        bad += [] if row.agrees else [seed]
+        bad += [] if row.agrees or row.refused else [seed]
+        refused += [seed] if row.refused else []
         if args.out:
             with args.out.open("a") as file:
                 file.write(json.dumps({**asdict(row), "agrees": row.agrees}) + "\n")
         dr.flush_malloc_cache()
-    print(f"{len(seeds) - len(bad)} of {len(seeds)} random scenes agree; not: {bad}")
+    agree = len(seeds) - len(bad) - len(refused)
+    print(f"{agree} of {len(seeds) - len(refused)} random scenes agree; not: {bad}; refused: {refused}")
     sys.exit(bool(bad))
 
 
