@@ -18,7 +18,7 @@ from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .geometry.intersections import Intersections
 from .geometry.meshes import Geometry, objects_below
 from .geometry.sources import Sources
-from .geometry.texture_lines import TextureLines, jumping_textures
+from .geometry.texture_lines import TextureLines, jumping_textures, maps_in_steps
 from .lights import Lights
 from .projection.film_parts import Batch, FilmPart, film_parts
 from .projection.sensors import Projection
@@ -62,6 +62,7 @@ __all__ = [
     "find_edges",
     "find_welded_edges",
     "jumping_textures",
+    "maps_in_steps",
     "objects_below",
     "sample_edge",
     "stratified",

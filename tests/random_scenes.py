@@ -57,6 +57,7 @@ SPECIAL = {
     "jumps": "all that things have are perfect mirrors, smooth glass, and textures that jump",
     "instances": "there are two or three instances of meshes besides, which mostly are what moves",
     "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
+    "parameters": "their materials have all kinds of values, and any parameters change (`random_parameters.py`)",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
@@ -235,7 +236,7 @@ class Generator:
         return {
             "type": "bitmap",
             "bitmap": mi.Bitmap(self.rng.uniform(low, high, (height, width, 3)).astype(np.float32)),
-            "raw": True,
+            "raw": not mi.is_spectral,  # Mitsuba refuses raw colours there
             "filter_type": "bilinear",
             "wrap_mode": self.pick("clamp", "mirror"),
         }
@@ -305,7 +306,7 @@ class Generator:
 
     @staticmethod
     def two_sided(bsdf: dict) -> dict:
-        return bsdf if bsdf["type"] in ("twosided", "principled") else {"type": "twosided", "inner": bsdf}
+        return bsdf if bsdf["type"] in ("twosided", "principled", "principledthin") else {"type": "twosided", "inner": bsdf}
 
     def emitter(self, low: float, high: float) -> dict:
         return {"type": "area", "radiance": {"type": "rgb", "value": [self.uniform(low, high) for _ in range(3)]}}
@@ -640,6 +641,10 @@ def make(seed: int, sampler: str = "independent", home: bool = False, special: s
         from random_rooms import RoomGenerator  # which is built on this file
 
         return RoomGenerator(seed, sampler, home, special).make()
+    if special == "parameters":
+        from random_parameters import ParameterGenerator
+
+        return ParameterGenerator(seed, sampler, home, special).make()
     return Generator(seed, sampler, home, special).make()
 
 

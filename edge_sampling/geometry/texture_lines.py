@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -17,13 +18,17 @@ import numpy as np
 
 from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
 from .mapped_horizons import mapped_horizons
-from .meshes import Geometry, has_place, has_texcoords, is_met, objects_below, pointer, texture_coordinates
+from .meshes import Geometry, has_place, has_texcoords, is_map, is_met, objects_below, pointer, texture_coordinates
 
 #: The texture that shows a volume on a surface.
 VOLUME = "VolumeAdapter"
 
 #: Texture units of GPUs know places between texels in steps of this size (documentation of `drjit.cuda.Texture2f`).
 TEXTURE_UNIT_STEP = 1 / 256
+
+#: Texels at which a bitmap is looked at for such steps, places in each step, and the first texels of a row that are
+#: looked at: as far as single precision tells these places apart.
+TEXELS, PLACES_OF_STEP, FIRST_TEXELS = 1024, 8, 2048
 
 #: Points at which a volume is looked at for its brightest and its darkest voxel.
 PLACES = 2**20
@@ -177,7 +182,7 @@ def _lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
         matrix = size[:, None] * to_uv
         if any(o is t for t in bumps):
             # Slopes jump in the middle of texels. GPUs may take a place close to it for one on the other side.
-            step = 0.0 if mi.variant().startswith("llvm") else TEXTURE_UNIT_STEP
+            step = TEXTURE_UNIT_STEP if _in_steps(o) else 0.0
             found.append(Lattice(matrix - [[0, 0, 0.5], [0, 0, 0.5]], light, step))
         elif _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()):
             found.append(Lattice(matrix, light))
@@ -206,6 +211,46 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
     ]
 
 
+def maps_in_steps(shapes: Sequence[Any]) -> list[str]:
+    """Names of the bitmaps of normals and heights which a GPU interpolates in steps."""
+    found = {}
+    for shape in shapes:
+        below = objects_below(shape)
+        for name, o in below.items():
+            if isinstance(o, mi.BSDF) and is_map(o):
+                child = f"{name}.{'nested_texture' if o.class_name() == 'BumpMap' else 'normalmap'}"
+                texture = below.get(child.lstrip("."))
+                if texture is not None and has_place(texture) and _in_steps(texture):
+                    found[id(texture)] = f'"{shape.id()}.{child}"'
+    return list(found.values())
+
+
+def _in_steps(texture: mi.Texture) -> bool:
+    """Is a bitmap interpolated between the middles of its texels by no more than `1 / TEXTURE_UNIT_STEP` values?"""
+    if not texture.class_name().startswith("Bitmap"):
+        return False
+    size = np.array(texture.resolution(), float)
+    corners = np.random.default_rng(0).uniform(0, np.minimum(size, FIRST_TEXELS), (TEXELS, 2))
+    apart = TEXTURE_UNIT_STEP / PLACES_OF_STEP * np.arange(2 * PLACES_OF_STEP + 1)
+    places = (corners[:, None] + apart[:, None]) / size
+    to_uv = np.array(mi.traverse(texture)["to_uv"].matrix, float)
+    uv = (places.reshape(-1, 2) - to_uv[:2, 2]) @ np.linalg.pinv(to_uv[:2, :2]).T
+    with dr.suspend_grad():
+        values = np.array(_value(texture, mi.Point2f(uv.T.astype(np.float32)))).reshape(-1, TEXELS, len(apart))
+    same = (np.diff(values, axis=2) == 0).all(0)  # in all channels
+    varies = ~same.all(1)
+    return bool(varies.any() and same[varies].mean() > 0.5)
+
+
+def _value(texture: Any, at: mi.Point2f | mi.Point3f) -> mi.Spectrum:
+    """At texture coordinates, or in space."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(at))
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(550)
+    setattr(si, "uv" if isinstance(at, mi.Point2f) else "p", at)
+    return texture.eval(si)
+
+
 def texture_values(texture: mi.Texture) -> list[Any]:
     """Texels, or colours: arrays, detached."""
     return [dr.detach(v).array for v in _colours(texture)]
@@ -230,15 +275,8 @@ def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 25
     """
     in_space = len(lower) == 3
     ends = np.random.default_rng(0).uniform(lower, upper, (pairs, 2, len(lower)))
+    value = partial(_value, texture)
     with dr.suspend_grad():
-
-        def value(at: mi.Point2f | mi.Point3f) -> mi.Spectrum:
-            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(at))
-            if mi.is_spectral:
-                si.wavelengths = type(si.wavelengths)(550)
-            setattr(si, "p" if in_space else "uv", at)
-            return texture.eval(si)
-
         extremes = _brightest_and_darkest_in_space(texture, value) if in_space else _brightest_and_darkest(texture)
         ends = np.concatenate([ends, extremes]).astype(np.float32)
         difference = lambda f, g: dr.max(dr.abs(f - g))

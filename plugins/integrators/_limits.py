@@ -15,12 +15,14 @@ from rimlight.edge_sampling import (
     Geometry,
     film_parts,
     jumping_textures,
+    maps_in_steps,
     objects_below,
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_others
+from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
@@ -156,6 +158,12 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
         limits.append(
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
             f"{', '.join(mapped)} turn away from what they light."
+        )
+    stepped = maps_in_steps(moving.with_lines)
+    if stepped:
+        limits.append(
+            f"the derivative is off where the normals of maps turn away, since this GPU interpolates the bitmaps "
+            f'{", ".join(stepped)} in {round(1 / TEXTURE_UNIT_STEP)} steps; set their property "accel" to false.'
         )
     shown = depths.scatters(1) and any(is_mirror(s) for s in surfaces(scene))
     slides = moving.camera or moving.lights or (shown and moving.anything)

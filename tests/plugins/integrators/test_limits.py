@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from random_scenes import ball
 
+from rimlight.edge_sampling.geometry import texture_lines
+
 FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
 
 
@@ -66,6 +68,39 @@ def test_far_plane_of_each_sensor():
     dr.enable_grad(params["floor.vertex_positions"])
     params.update()
     assert [len(integrator.plan(scene, sensor).limits) for sensor in (other, scene.sensors()[0], other)] == [0, 1, 0]
+
+
+# ---------------------- Maps on a GPU ----------------------
+
+
+@pytest.mark.parametrize(("kind", "name"), [("bumpmap", "heights"), ("normalmap", "normalmap")])
+@pytest.mark.parametrize("steps", [False, True])
+def test_maps_that_are_interpolated_in_steps(monkeypatch, kind, name, steps):
+    """As the texture units of a GPU do it: places are rounded to 1/256 of a texel."""
+    exact = texture_lines._value
+
+    def rounded(texture, at):
+        size = np.array(texture.resolution(), float)
+        return exact(texture, mi.Point2f(*(dr.round(x * n * 256) / (n * 256) for x, n in zip(at, size, strict=True))))
+
+    if steps:
+        monkeypatch.setattr(texture_lines, "_value", rounded)
+    texels = np.random.default_rng(0).uniform(0.4, 0.6, (5, 7, 3)).astype(np.float32)
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+    board = cases.horizontal((0, 0, 0), 1, "board", bsdf={"type": kind, name: bitmap, "inner": cases.diffuse(0.5)})
+    scene = cases.scene(sensor=cases.camera((0, 3, -3), (0, 0, 0)), board=board, sky=cases.constant())
+    said_so = ["in 256 steps" in m and '"accel"' in m for m in said(scene, "board.vertex_positions")]
+    assert sum(said_so) == steps
+
+
+def test_bitmaps_of_any_size_and_format_are_interpolated_without_steps():
+    random = np.random.default_rng(0)
+    for size in (1, 2, 300, 3000):
+        texels = random.random((size, size, 3))
+        for values in (texels.astype(np.float32), texels.astype(np.float16), (255 * texels).astype(np.uint8)):
+            made = {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "format": "auto"}
+            place = mi.ScalarTransform3f().scale([2, 3]).rotate(20)
+            assert not texture_lines._in_steps(mi.load_dict({**made, "to_uv": place}))
 
 
 # ---------------------- Signed distances ----------------------
