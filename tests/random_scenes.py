@@ -306,7 +306,8 @@ class Generator:
 
     @staticmethod
     def two_sided(bsdf: dict) -> dict:
-        return bsdf if bsdf["type"] in ("twosided", "principled", "principledthin") else {"type": "twosided", "inner": bsdf}
+        both = ("twosided", "principled", "principledthin")
+        return bsdf if bsdf["type"] in both else {"type": "twosided", "inner": bsdf}
 
     def emitter(self, low: float, high: float) -> dict:
         return {"type": "area", "radiance": {"type": "rgb", "value": [self.uniform(low, high) for _ in range(3)]}}
