@@ -135,9 +135,7 @@ class ParameterGenerator(Generator):
 
     # ---------------------- Motion ----------------------
 
-    def make_motion(
-        self, scene: mi.Scene, cameras: bool
-    ) -> tuple[mi.SceneParameters, Callable[[mi.Float], None]]:
+    def make_motion(self, scene: mi.Scene, cameras: bool) -> tuple[mi.SceneParameters, Callable[[mi.Float], None]]:
         params = mi.traverse(scene)  # what is looked at counts as changed: another one is used
         keys = [k for k, _ in params if self.may_change(params, k) and (cameras or not k.startswith("sensor"))]
         chosen = [str(k) for k in self.rng.choice(keys, min(len(keys), self.pick(1, 1, 2, 3)), replace=False)]
