@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -30,10 +30,19 @@ def steps_for_all(problem: Problem) -> int:
     return math.ceil(len(problem.target) / (problem.views_per_step or len(problem.target)))
 
 
-def tasks(problem: Problem, step: int, segment: Segment, *, doubt: Collection[int], show: bool) -> list[Task]:
+def tasks(
+    problem: Problem,
+    step: int,
+    segment: Segment,
+    *,
+    doubt: Collection[int],
+    show: bool,
+    shares: Mapping[str, float],
+) -> list[Task]:
     """The renders of a step.
 
     doubt : targets of which shall be said what makes no sense about them. show : shall the first view be shown?
+    shares : see `Progress`.
     """
     return [
         Task(
@@ -44,6 +53,7 @@ def tasks(problem: Problem, step: int, segment: Segment, *, doubt: Collection[in
             stage=segment.number,
             doubt=part == 0 and view in doubt,
             show=part == 0 and view == 0 and show,
+            shares=tuple(shares.items()),
         )
         for place, view in enumerate(views(problem, step))
         for part in range(problem.parts)

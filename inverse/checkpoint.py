@@ -18,7 +18,7 @@ from rimlight.exr import replacing
 from .packing import Packed, pack, unpack
 
 #: Of the file's layout.
-VERSION = 3
+VERSION = 4
 
 
 def save(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:

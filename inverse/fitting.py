@@ -18,7 +18,7 @@ from tqdm import tqdm
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.loading import InputError
 
-from . import batches, free_parameters, progress, sources
+from . import balancing, batches, free_parameters, progress, sources
 from . import problem as problems
 from . import result as results
 from .conforming import functions
@@ -238,7 +238,7 @@ class Fit:
         attached = self.optimiser.values()
         values = {key: to_numpy(value) for key, value in attached.items()}
         new = set(batches.views(self.problem, now.step)) - self._seen
-        tasks = batches.tasks(self.problem, now.step, segment, doubt=new, show=self.shows())
+        tasks = batches.tasks(self.problem, now.step, segment, doubt=new, show=self.shows(), shares=now.shares)
         self._seen |= new
         found = self.executor.gradient(values, tasks)
         loss = float(np.mean([found.losses[task.key] for task in tasks]))
@@ -262,15 +262,16 @@ class Fit:
             for parameter in self.parameters:
                 if any(np.any(gradients[key]) for key in parameter.keys):
                     now.touched.add(parameter.name)
+            before = self.latents()
             good = self.optimiser.step(attached, gradients, rate, penalty)
+            if good and self.problem.balance and now.balanced != now.segment:
+                balancing.divide(self, tasks[0], before)
         now.bad = 0 if good else now.bad + 1
         now.skipped += not good
         step = Step(now.step, segment.number, now.iteration, loss, metrics, errors, rate, not good)
         now.step += 1
         now.iteration += 1
-        if now.step == WINDOW * -(
-            -len(self.problem.target) // (self.problem.views_per_step or len(self.problem.target))
-        ):
+        if now.step == WINDOW * batches.steps_for_all(self.problem):
             for name in self.silent():
                 log.warning('"%s" has no influence on the pictures: its gradient is 0', name)
         if now.iteration >= stage.iterations or self._stalls():

@@ -215,6 +215,9 @@ class Problem:
     """End a stage if its loss has not fallen by 0.1 % within this many steps. Default: never."""
     seconds: float | None = None
     """End the fit after this many seconds. Default: no limit."""
+    balance: bool = False
+    """After the first step of each stage, measure how noisy each part of the derivative is, and divide the samples
+    among them so that a given time leaves the least error. Takes about as long as ten to twenty steps."""
     max_bad: int = 20
     """End the fit after this many gradients in a row that are not finite. Each is skipped and counted."""
     freeze: bool = True

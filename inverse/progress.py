@@ -65,6 +65,8 @@ class Progress:
         error, and the latents then.
     fell : last iteration of the segment at which the loss had fallen.
     found : of starts that have been tried: mean loss at their end, and latents.
+    shares : by what the samples of each part of the derivative are multiplied, see `Problem.balance`; empty: by 1.
+    balanced : the segment in which that was measured.
     seconds : in the loop, of all runs.
     """
 
@@ -86,6 +88,8 @@ class Progress:
     best: dict[str, np.ndarray] = field(default_factory=dict)
     fell: int = 0
     found: list[tuple[float, dict[str, np.ndarray]]] = field(default_factory=list)
+    shares: dict[str, float] = field(default_factory=dict)
+    balanced: int = -1
     seconds: float = 0.0
 
     def note_scores(self, scores: Mapping[str, float]) -> None:
@@ -99,7 +103,7 @@ class Progress:
 LISTS, TABLES = ("losses", "segments", "times"), ("errors", "scores")
 
 #: Fields that JSON can say.
-PLAIN = ("segment", "iteration", "step", "skipped", "bad", "fell", "seconds", "doubts")
+PLAIN = ("segment", "iteration", "step", "skipped", "bad", "fell", "seconds", "doubts", "shares", "balanced")
 
 #: Fields that may be infinite, which JSON cannot say.
 SCALARS = ("best_loss", "best_error")

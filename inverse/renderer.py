@@ -50,7 +50,8 @@ class Task:
 
     target : number of the target. width : of the film, pixels; None: as the scene has it. spp : samples per pixel.
     seed : of the image; that of the derivative differs from it. stage : number of the one whose loss it is.
-    doubt : say what makes no sense about the target. show : return the picture.
+    doubt : say what makes no sense about the target. show : return the picture. shares : by what
+    the samples of each part of the derivative are multiplied, see `Problem.balance`.
     """
 
     target: int
@@ -60,6 +61,7 @@ class Task:
     stage: int = 0
     doubt: bool = False
     show: bool = False
+    shares: tuple[tuple[str, float], ...] = ()
 
     @property
     def key(self) -> tuple[int, int]:
@@ -126,6 +128,8 @@ class Renderer:
         # Every load of a scene costs memory that never comes back.
         self.scenes = {key: sources.scene(s, problem.define) for key, s in {sources.key(s): s for s in used}.items()}
         loaded = {key: LoadedScene(scene, load_integrator(kind, **options)) for key, scene in self.scenes.items()}
+        if problem.balance and not all(getattr(s.integrator, "BALANCES", False) for s in loaded.values()):
+            raise InputError(f"fit: balance: {kind} does not divide its samples; use direct_edge or prb_edge")
         self.views = [View(problem, i, loaded[k], self.losses) for i, k in enumerate(map(sources.key, used))]
         self.params: dict[str, Any] = {}
         for scene in loaded.values():
@@ -164,7 +168,7 @@ class Renderer:
                 view.resize(task.width)
                 image = view.render(task.seed, task.spp)
                 loss, by_pixel, scores = view.compared(image, task.stage)
-                view.backward(by_pixel, derived_seed(task.seed), task.spp)
+                view.backward(by_pixel, derived_seed(task.seed), task.spp, task.shares)
                 doubts = {task.target: text} if task.doubt and (text := view.doubts(image)) else {}
                 yield Gradient({}, {task.key: loss}, {task.key: scores}, doubts, image if task.show else None)
         for of_scene in leaves:
@@ -186,6 +190,15 @@ class Renderer:
         view = self.views[task.target]
         view.resize(task.width)
         return view.forward({key: (leaf, change[key]) for key, leaf in leaves.items()}, task.seed, task.spp)
+
+    def balance(
+        self, values: Mapping[str, np.ndarray], change: Mapping[str, np.ndarray], task: Task
+    ) -> tuple[tuple[str, float], ...]:
+        """`Task.shares` that leave the least error in a given time, where the values change like this."""
+        (leaves,) = self._set(values, [task])
+        view = self.views[task.target]
+        view.resize(task.width)
+        return view.balance({key: (leaf, change[key]) for key, leaf in leaves.items()}, task.seed)
 
     def check(self, stages: Iterable[int], target: int) -> None:
         """Say at once what is wrong with a target, or with the losses of stages. Raises InputError, OSError: it is."""

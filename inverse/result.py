@@ -9,14 +9,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from rimlight.loading import one_line
 
-from . import free_parameters, losses
-from .free_parameters import to_numpy
+from . import losses
+from .balancing import way
 from .problem import Problem
 from .renderer import Renderer, Task
 from .view import MAX_SAMPLES, View, derived_seed
@@ -120,7 +118,7 @@ def of(fit: Fit) -> Result:
     on = Task(0, None, min(_spp(first), DERIVATIVE_SPP), derived_seed(seed, 2**31 + 2))
     derivative = None
     try:
-        (derivative,) = fit.executor.map(_derivative, on, [(0, states["result"], _way(fit, latents))])
+        (derivative,) = fit.executor.map(_derivative, on, [(0, states["result"], way(fit, fit.start, latents))])
     except RuntimeError as error:  # of an integrator that cannot; what was found is not lost by that
         if isinstance(error, Lost):
             raise
@@ -217,17 +215,6 @@ def _measures(view: View, image: np.ndarray) -> dict[str, float]:
     target, weight = view.picture()
     _, _, metrics = view.compared(image, -1)
     return metrics | losses.measures(image, target, weight, view.shows_light)
-
-
-def _way(fit: Fit, latents: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Derivatives of the scene parameters at the result, on the straight way from the start through it."""
-    held = {name: mi.Float(latent) for name, latent in latents.items()}
-    for name, latent in held.items():
-        dr.enable_grad(latent)
-        dr.set_grad(latent, mi.Float(latents[name] - fit.start[name]))
-    found = free_parameters.values(fit.parameters, held)
-    dr.forward_to(found)
-    return {key: to_numpy(dr.grad(value)) for key, value in found.items()}
 
 
 def _truth(fit: Fit) -> dict[str, np.ndarray]:

@@ -56,7 +56,7 @@ class View:
                 f"fit: target.{number}: the film is cropped, so that its resolution cannot change; leave out "
                 "resolution in the stages, or the crop in the scene"
             )
-        self._memory: dict[Any, tuple[float, float]] = {}  # size of the film -> what `_measured` says
+        self._memory: dict[Any, tuple[float, float]] = {}  # size of the film, shares -> what `_measured` says
         self.functions: dict[Any, tuple[Callable, Callable]] = {}
         self._smaller: tuple[tuple[np.ndarray, np.ndarray], tuple[int, int]] | None = None
         self._picture: tuple[np.ndarray, np.ndarray] | None = None
@@ -215,10 +215,12 @@ class View:
         part = slice(0, self._channels) if channel is None else self.integrator.layout(self._channels)[channel]
         return slice(part.start, part.stop - 1) if self.alpha and self.shows_light else part
 
-    def backward(self, by_pixel: np.ndarray, seed: int, spp: int) -> None:
-        """Derivatives with respect to what carries a gradient. by_pixel : (H, W, C), of the loss."""
-        passes = self._passes(spp)
-        _, derivative = self._functions(spp // passes)
+    def backward(self, by_pixel: np.ndarray, seed: int, spp: int, shares: tuple[tuple[str, float], ...] = ()) -> None:
+        """Derivatives with respect to what carries a gradient. by_pixel : (H, W, C), of the loss. shares : of the
+        samples, see `Task`."""
+        self._divide(shares)
+        passes = self._passes(spp, shares)
+        _, derivative = self._functions(spp // passes, shares)
         part = self._part()
         whole = np.zeros((*by_pixel.shape[:2], self._channels), np.float32)
         whole[..., part] = by_pixel[..., : part.stop - part.start]
@@ -228,7 +230,7 @@ class View:
             for s in _seeds(seed, passes):
                 derivative(self.scene, self.integrator, weight, s)
 
-    def _passes(self, spp: int) -> int:
+    def _passes(self, spp: int, shares: tuple[tuple[str, float], ...] = ()) -> int:
         """In how many launches samples are taken, so that they need no more memory than they may: a divisor of spp.
 
         Raises
@@ -238,9 +240,9 @@ class View:
         if self.problem.max_memory is None:
             return 1
         size = tuple(self.sensor.film().crop_size())
-        if size not in self._memory:
-            self._memory[size] = self._measured()
-        before, each = self._memory[size]
+        if (size, shares) not in self._memory:
+            self._memory[size, shares] = self._measured(shares)
+        before, each = self._memory[size, shares]
         most = int((self.problem.max_memory - before) / each)
         if most < 1:
             raise InputError(
@@ -249,9 +251,9 @@ class View:
             )
         return next(n for n in range(1, spp + 1) if spp % n == 0 and spp // n <= most)
 
-    def _measured(self) -> tuple[float, float]:
+    def _measured(self, shares: tuple[tuple[str, float], ...]) -> tuple[float, float]:
         """Memory that Dr.Jit uses before a launch, and more for each sample per pixel; MB."""
-        image, derivative = self._functions(1)
+        image, derivative = self._functions(1, shares)
         backend, none = dr.backend_v(mi.Float), dr.opaque(mi.UInt32, 0)
         dr.flush_malloc_cache()
         dr.detail.malloc_clear_statistics()
@@ -262,25 +264,49 @@ class View:
             derivative(self.scene, self.integrator, weight, none)
         return before / 1e6, (dr.detail.malloc_watermark(backend) - before) / 1e6
 
+    def balance(self, change: Mapping[str, tuple[mi.Float, np.ndarray]], seed: int) -> tuple[tuple[str, float], ...]:
+        """Shares of the samples, for least error in a given time: see `EdgeIntegrator.balance`.
+
+        change : as of `forward`.
+
+        Raises
+        ------
+        RuntimeError : nothing is seen to change.
+        """
+        self._forward(change, dr.ADFlag.ClearEdges)
+        with no_collection():
+            found = self.integrator.balance(self.scene, self.loaded.params, sensor=self.sensor, seed=seed)
+        return tuple(found.shares.items())
+
+    def _divide(self, shares: tuple[tuple[str, float], ...]) -> None:
+        if hasattr(self.integrator, "shares"):
+            self.integrator.shares = dict(shares)
+
+    @staticmethod
+    def _forward(change: Mapping[str, tuple[mi.Float, np.ndarray]], flags: dr.ADFlag = dr.ADFlag.Default) -> None:
+        for leaf, derivative in change.values():
+            dr.set_grad(leaf, mi.Float(derivative.astype(np.float32).ravel()))
+        dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in change.values()))
+        dr.traverse(dr.ADMode.Forward, flags)
+
     def forward(self, change: Mapping[str, tuple[mi.Float, np.ndarray]], seed: int, spp: int) -> np.ndarray:
         """Derivative image. change : key -> what `set` returned, and its derivative."""
+        self._divide(())
         with no_collection():
             image = mi.render(
                 self.scene, self.loaded.params, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed
             )
-            for leaf, derivative in change.values():
-                dr.set_grad(leaf, mi.Float(derivative.astype(np.float32).ravel()))
-            dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in change.values()))
-            dr.traverse(dr.ADMode.Forward)
+            self._forward(change)
             return self._colours(np.array(dr.grad(image)))
 
     def _image(self, seed: Any, spp: int) -> mi.TensorXf:
         with dr.suspend_grad():
             return self.integrator.render(self.scene, sensor=self.sensor, seed=seed, spp=spp)
 
-    def _functions(self, spp: int) -> tuple[Callable, Callable]:
-        """Image and derivative. Recorded apart for each size of the film, which Dr.Jit does not look at."""
-        key = spp, tuple(self.sensor.film().crop_size())
+    def _functions(self, spp: int, shares: tuple[tuple[str, float], ...] = ()) -> tuple[Callable, Callable]:
+        """Image and derivative. Recorded apart for each size of the film, which Dr.Jit does not look at, and for each
+        division of the samples of the derivative."""
+        key = spp, shares, tuple(self.sensor.film().crop_size())
         if key not in self.functions:
             sensor = self.sensor
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rimlight.inverse import free_parameters, losses, renderer
-from rimlight.inverse import result as results
+from rimlight.inverse import balancing, free_parameters, losses, renderer
 from rimlight.inverse.fitting import Fit
 from rimlight.inverse.optimisers import inner_product
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
@@ -137,9 +136,8 @@ def test_derivative_image_is_that_on_the_way(room):
         return run.renderer.image(run.values(at), Task(0, None, 4096, seed)).astype(np.float64)
 
     seeds, at = range(4), run.values(result)
-    found = np.mean(
-        [run.renderer.derivative(at, results._way(run, result), Task(0, None, 1024, seed)) for seed in seeds], 0
-    )
+    way = balancing.way(run, run.start, result)
+    found = np.mean([run.renderer.derivative(at, way, Task(0, None, 1024, seed)) for seed in seeds], 0)
     expected = np.mean([image(step, 9 + seed) - image(-step, 9 + seed) for seed in seeds], 0) / (2 * step)
     print(np.abs(found - expected).sum() / np.abs(expected).sum())
     assert np.abs(found - expected).sum() < 0.04 * np.abs(expected).sum()
@@ -280,7 +278,7 @@ def test_scenes_are_not_freed_while_a_function_is_recorded(room, monkeypatch):
     plain = renderer.views[0]
     functions = plain._functions(1)
     spies = [lambda *a, f=f: (seen.append(gc.isenabled()), f(*a))[1] for f in functions]
-    monkeypatch.setattr(plain, "_functions", lambda spp: spies)
+    monkeypatch.setattr(plain, "_functions", lambda spp, shares=(): spies)
     renderer.gradient({FLOOR: np.float32([0.3, 0.4, 0.5])}, [Task(0, None, 1, 0)])
     assert seen == [False, False] and gc.isenabled()
 

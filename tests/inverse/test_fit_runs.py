@@ -102,6 +102,7 @@ def test_killed_fits_resume_bit_by_bit(tmp_path):
         starts=Starts(count=3, move=0.1, turn=10, value=0.1),
         clip=2.0,
         parts=2,
+        balance=True,
     )
     problems.write(tmp_path / "fit.toml", posed)
     (tmp_path / "run.py").write_text(SCRIPT)
