@@ -208,11 +208,13 @@ def _pair(
     part[turn, 1] = 1 - part[turn, 1, ::-1]
     mesh = np.stack([lone.mesh[edge[a]], lone.mesh[edge[b]]], 1)
     even = np.array([_is_even(m) for m in geometry.meshes])[mesh[:, 0]]
+    # As where sides are whole: of faces that run through it in the same direction, one shows its back.
+    flat = even & (count == 2) & turn & (mesh[:, 0] == mesh[:, 1])
     new = Edges(
         vertices=vertices.astype(np.uint32),
         opposite=np.stack([lone.edges.opposite[edge[a], 0], lone.edges.opposite[edge[b], 0]], 1),
         mesh=mesh.astype(np.uint32),
-        kind=np.where(even & (count == 2) & (mesh[:, 0] == mesh[:, 1]), EdgeKind.FLAT, EdgeKind.JUMP).astype(np.uint8),
+        kind=np.where(flat, EdgeKind.FLAT, EdgeKind.JUMP).astype(np.uint8),
         count=count.astype(np.uint32),
         is_line=np.zeros(len(a), bool),
         part=part.astype(np.float32),

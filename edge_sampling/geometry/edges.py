@@ -20,7 +20,7 @@ class EdgeKind(IntEnum):
     """What makes an edge a boundary of the image.
 
     JUMP   : always: it has one face only, or more than two, or its two sides differ in shape, texture coordinates,
-             attributes, or the frame of tangents that a material looks at.
+             attributes, or the frame of tangents that a material looks at, or one of them shows its back.
     FLAT   : as a silhouette, and where its faces are not coplanar: the shading normal is that of the face.
     SPLIT  : as a silhouette, and where the vertex normals of its two sides differ.
     SMOOTH : as a silhouette only.
@@ -154,6 +154,8 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     i1, j1, o1 = _corners(face, face1, corner1)
     turn = weld[i0] != weld[i1]
     i1, j1 = np.where(turn, j1, i1), np.where(turn, i1, j1)
+    # Faces that run through their edge in the same direction look to different sides: one of them shows its back.
+    opposed = ~turn & (count == 2)
     mesh0, mesh1 = mesh_of_face[face0], mesh_of_face[face1]
 
     interpolated = np.array([meshes.has_interpolated_normals(m) for m in geometry.meshes])
@@ -164,7 +166,7 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     kind = np.full(len(face0), EdgeKind.SMOOTH, np.uint8)
     kind[split] = EdgeKind.SPLIT
     kind[~interpolated[mesh0]] = EdgeKind.FLAT
-    kind[(count != 2) | (mesh0 != mesh1) | seam | everywhere[mesh0]] = EdgeKind.JUMP
+    kind[(count != 2) | opposed | (mesh0 != mesh1) | seam | everywhere[mesh0]] = EdgeKind.JUMP
     edges = Edges(
         vertices=np.stack([np.stack([i0, j0], 1), np.stack([i1, j1], 1)], 1).astype(np.uint32),
         opposite=np.stack([o0, o1], 1).astype(np.uint32),

@@ -74,6 +74,18 @@ def test_fan_of_three_faces_jumps():
     assert (edges.kind == EdgeKind.JUMP).all()
 
 
+@pytest.mark.parametrize("smooth", [False, True])
+def test_faces_that_look_to_different_sides_jump(smooth):
+    """Of one of them, the back is seen."""
+    vertices, faces = grid(4)
+    faces = faces.copy()
+    faces[3] = faces[3, ::-1]
+    turned = edges_of(cases.mesh("sheet", vertices, faces, normals=smooth))
+    around = np.sort(turned.vertices[turned.kind == EdgeKind.JUMP, 0][~turned.open[turned.kind == EdgeKind.JUMP]], 1)
+    a, b, c = np.sort(faces[3])
+    assert {tuple(e) for e in around.tolist()} <= {(a, b), (a, c), (b, c)} and len(around) >= 2
+
+
 def test_edges_of_two_meshes_that_coincide_are_one():
     """Even if their coordinates differ by rounding, as after two transformations."""
     left = cases.mesh("left", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])

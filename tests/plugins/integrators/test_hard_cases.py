@@ -398,3 +398,28 @@ def test_fold_beside_a_contour_counts_once(kind, gap):
     pixels_per_unit = 16 / 4 if kind == "orthographic" else 16 / 2 / np.tan(np.radians(22.5))
     area = 2 if kind == "orthographic" else 1 / 5**2 + 1 / 4**2
     assert image[..., 0].sum() == pytest.approx(-area * pixels_per_unit**2, rel=0.01)
+
+
+# ---------------------- Faces that look to different sides ----------------------
+
+
+@pytest.mark.parametrize("angle", [0, 30])
+@pytest.mark.parametrize("divided", [False, True])
+def test_back_of_a_face_beside_the_front_of_another(angle, divided):
+    """Of a lamp of two faces, one shows its dark back: where their common edge moves, the bright area grows by half of
+    its length times the way."""
+    z = float(np.sin(np.radians(angle)))
+    vertices = [[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, z], [0, 0, 0]]
+    faces = [[0, 1, 2], [0, 4, 3], [4, 1, 3]] if divided else [[0, 1, 2], [0, 1, 3]]
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    board = cases.mesh("board", vertices, faces, emitter=lamp, bsdf=cases.diffuse(0.0))
+    sensor = cases.camera((0.2, 0.1, 5), (0.2, 0.1, 0), kind="orthographic")
+    scene = cases.scene(sensor=sensor, board=board)
+    vertices = (0, 1, 4) if divided else (0, 1)
+    motion = Motion(scene, "board.vertex_positions", direction=(1, 0, 0), vertices=vertices)
+    integrator = mi.load_dict({"type": "direct_edge"})
+    seen = np.array(mi.render(scene, integrator=integrator, spp=1024, seed=9))[..., 0].sum()
+    found = [np.array(derivative_image(scene, integrator, motion, spp=256, seed=i))[..., 0].sum() for i in range(8)]
+    # The bright face is a triangle of width 1: its area grows by its own size for each unit.
+    error = np.std(found, ddof=1) / np.sqrt(len(found))
+    assert abs(np.mean(found) - seen) < 4 * error + 0.01 * seen and error < 0.02 * seen
