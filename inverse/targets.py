@@ -113,6 +113,11 @@ def read_picture(source: Any) -> tuple[np.ndarray, bool]:
         raise FileNotFoundError(f'fit: there is no file "{path}"')
     if path.suffix.lower() == ".exr":
         layers, _ = read_exr(path)
+        if "" not in layers and len(layers) > 1:
+            raise InputError(
+                f'fit: "{path.name}" has the layers {", ".join(layers)}, and which of them is the picture is unknown: '
+                "give it no name (channels R, G, B), or a file of its own"
+            )
         return layers.get("", next(iter(layers.values()))), False
     from skimage import io
 
@@ -121,8 +126,10 @@ def read_picture(source: Any) -> tuple[np.ndarray, bool]:
         image = np.asarray(mi.Bitmap(str(path)) if path.suffix.lower() == ".png" else io.imread(path))
     except (OSError, ValueError, SyntaxError, RuntimeError) as error:
         raise OSError(f'fit: cannot read "{path}": {one_line(error)}') from None
-    if not np.issubdtype(image.dtype, np.unsignedinteger):
-        raise InputError(f'fit: "{path.name}" is no picture of 8 or 16 bits a channel')
+    if not np.issubdtype(image.dtype, np.unsignedinteger) and not np.issubdtype(image.dtype, np.floating):
+        raise InputError(f'fit: "{path.name}" is no picture of 8 or 16 bits a channel, or of floating point numbers')
+    if path.suffix.lower() in (".jpg", ".jpeg") and image.ndim == 3 and image.shape[2] == 4:
+        raise InputError(f'fit: "{path.name}" is printed in four colours (CMYK); convert it to RGB')
     return _decoded(image, path.name)
 
 

@@ -11,8 +11,9 @@ from tqdm import tqdm
 
 from rimlight.edge_sampling.refusals import InputError
 
-from .dataset import DIRECTIONS, INTENSITIES, LUMINANCE, read_camera, read_mask, read_names, read_pixels, unit
+from .files import DIRECTIONS, INTENSITIES, read_camera, read_mask, read_names, read_pixels
 from .integration import ray_matrix
+from .vectors import LUMINANCE, unit
 
 #: As many images as a quadratic polynomial over light directions needs to be told from single exposures.
 FEWEST = 20

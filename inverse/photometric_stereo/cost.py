@@ -16,7 +16,7 @@ FIXED, READING, OF_VALUE, OF_PIXEL, NEAR = 7e8, 28, 47, 1500, 20
 
 #: Seconds of one alternation: of any; on one core, for each value; and for each of those from which it fits the BSDF.
 #: Measured.
-OF_ALL, OF_VALUES, OF_BSDF = 0.5, 5e-6, 1.2e-4
+OF_ALL, OF_VALUES, OF_BSDF = 0.3, 1e-6, 7e-6
 
 #: Of control groups, version 2 and 1: files of their limit, of what is used, and of the part of that which the system
 #: takes back when it needs it. psutil looks at the machine alone.

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import functools
 import logging
-import re
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,10 +15,24 @@ import numpy as np
 from tqdm import tqdm
 
 from rimlight.edge_sampling.refusals import InputError
-from rimlight.inverse.targets import read_picture, srgb_to_linear
 from rimlight.leds import Led, read_leds, write_leds
 
 from .encoding import ENCODED, JUDGED, looks_encoded
+from .files import (
+    CAMERA,
+    DIRECTIONS,
+    DISTANCE,
+    INTENSITIES,
+    LEDS,
+    LIGHT_DISTANCE,
+    NAMES,
+    read_camera,
+    read_mask,
+    read_names,
+    read_numbers,
+    read_pixels,
+    read_truth,
+)
 from .integration import check_camera, ray_matrix
 from .vectors import LUMINANCE, every, unit
 
@@ -28,16 +40,6 @@ log = logging.getLogger(__name__)
 
 #: Part of the values that may be as large as the largest one, by chance.
 CLIPPED = 1e-3
-
-DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
-    "light_directions.txt",
-    "light_intensities.txt",
-    "filenames.txt",
-    "leds.csv",
-    "K.txt",
-    "distance.txt",
-    "light_distance.txt",
-)
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,8 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     else orthographic), `distance.txt` (see `Dataset.distance`), `light_distance.txt` (see `Dataset.with_near_lights`),
     and `Normal_gt.mat` or `Normal_gt.exr`.
 
-    Pictures are EXR, PNG, which is taken to be linear as DiLiGenT's are, or JPEG, which is decoded from sRGB.
+    Pictures are EXR, PNG or TIFF, which are taken to be linear as DiLiGenT's are, or JPEG, which is decoded from sRGB.
+    Those that are black in the mask are left out, and logged.
 
     images : read only so many, evenly from their list. 0: all.
 
@@ -221,13 +224,21 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     folder = Path(folder)
     setup = read_setup(folder, images=images)
     names, mask, intensities = setup.names, setup.mask, setup.intensities
-    values = np.empty((mask.sum(), len(names), 3), np.float32)
+    values, lit = np.empty((mask.sum(), len(names), 3), np.float32), []
     for k, name in enumerate(tqdm(names, desc="images", disable=True if len(names) < 10 else None, leave=False)):
-        values[:, k] = read_pixels(folder / name, mask) / intensities[k]
+        values[:, len(lit)] = read_pixels(folder / name, mask) / intensities[k]
+        if not (values[:, len(lit)] <= 0).all():
+            lit.append(k)
+    if 0 < len(lit) < len(names):
+        black = ", ".join(name for k, name in enumerate(names) if k not in lit)
+        log.warning("ps: black in the mask, and left out: %s; were these lamps on?", black)
+        setup, values = setup.chosen(lit), values[:, : len(lit)]
     few = every(values, JUDGED)
-    if not setup.near and looks_encoded(few * intensities.astype(np.float32), names, setup.lights, intensities):
+    if not setup.near and looks_encoded(
+        few * setup.intensities.astype(np.float32), setup.names, setup.lights, setup.intensities
+    ):
         log.warning(ENCODED)
-    return setup.dataset(values, mask, _truth(folder, mask))
+    return setup.dataset(values, mask, read_truth(folder, mask))
 
 
 @dataclass(frozen=True)
@@ -247,6 +258,12 @@ class Setup:
     def near(self) -> bool:
         return not isinstance(self.lights, np.ndarray)
 
+    def chosen(self, numbers: Sequence[int]) -> Setup:
+        """Of some of the images."""
+        lights = tuple(self.lights[k] for k in numbers) if self.near else self.lights[numbers]
+        names = tuple(self.names[k] for k in numbers)
+        return replace(self, names=names, lights=lights, intensities=self.intensities[numbers])
+
     def dataset(self, values: np.ndarray, mask: np.ndarray, truth: np.ndarray | None = None) -> Dataset:
         """Of these pixels."""
         data = Dataset(values, mask, self.lights, self.intensities, self.camera, truth, self.names, self.distance)
@@ -262,12 +279,12 @@ def read_setup(folder: Path, *, images: int = 0) -> Setup:
         intensities = np.array([led.intensity for led in leds])
         lights: np.ndarray | tuple[Led, ...] = tuple(replace(led, intensity=(1.0, 1.0, 1.0)) for led in leds)
     else:
-        directions = _numbers(folder / DIRECTIONS, 3)
+        directions = read_numbers(folder / DIRECTIONS, 3)
         if (lengths := np.linalg.norm(directions, axis=1)).min() == 0:
             raise InputError(f"ps: {DIRECTIONS}, line {lengths.argmin() + 1}: the direction is zero")
         lights = directions / lengths[:, None]
         given = folder / INTENSITIES
-        intensities = _numbers(given, 3) if given.is_file() else np.ones_like(lights)
+        intensities = read_numbers(given, 3) if given.is_file() else np.ones_like(lights)
     if len(lights) != len(names) or len(intensities) != len(names):
         raise InputError(
             f"ps: {folder.name}: {len(names)} images, {len(lights)} lights, {len(intensities)} intensities: there must "
@@ -275,15 +292,12 @@ def read_setup(folder: Path, *, images: int = 0) -> Setup:
         )
     if (intensities <= 0).any():
         raise InputError(f"ps: {folder.name}: light {int((intensities <= 0).any(1).argmax()) + 1} has no intensity")
-    if 0 < images < len(names):
-        chosen = np.arange(images) * len(names) // images
-        names, intensities = [names[k] for k in chosen], intensities[chosen]
-        lights = tuple(lights[k] for k in chosen) if near else lights[chosen]
     distance, away = (
-        float(_numbers(folder / name, 1)[0, 0]) if (folder / name).is_file() else None
+        float(read_numbers(folder / name, 1)[0, 0]) if (folder / name).is_file() else None
         for name in (DISTANCE, LIGHT_DISTANCE)
     )
-    return Setup(tuple(names), mask, lights, intensities, read_camera(folder), distance, away)
+    setup = Setup(tuple(names), mask, lights, intensities, read_camera(folder), distance, away)
+    return setup.chosen(np.arange(images) * len(names) // images) if 0 < images < len(names) else setup
 
 
 def write(folder: Path, data: Dataset) -> None:
@@ -315,95 +329,3 @@ def write(folder: Path, data: Dataset) -> None:
     from PIL import Image
 
     Image.fromarray(data.mask.astype(np.uint8) * 255).save(folder / "mask.png")
-
-
-def read_names(folder: Path) -> list[str]:
-    """Of the images of a folder: those that `filenames.txt` lists, else all pictures but masks and truths, by name.
-
-    Raises
-    ------
-    OSError : there is no such folder.
-    """
-    if not folder.is_dir():
-        raise FileNotFoundError(f'ps: there is no folder "{folder}"')
-    if (folder / NAMES).is_file():
-        lines = (folder / NAMES).read_text(encoding="utf-8").splitlines()
-        return [line.strip() for line in lines if line.strip()]
-    kinds = (".png", ".exr", ".jpg", ".jpeg")
-    other = lambda p: p.stem.lower().endswith("mask") or p.stem.lower() in ("normal_gt", "depth_gt")
-    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in kinds and not other(p))
-
-
-def read_mask(path: Path) -> np.ndarray:
-    """(H, W), bool: what is brighter than half of the brightest. Raises what `read` does."""
-    picture = _numbers_of_picture(path)[..., 0]
-    return picture > picture.max() / 2
-
-
-def read_pixels(path: Path, mask: np.ndarray) -> np.ndarray:
-    """Of a picture, the pixels of a mask: (P, 3), linear. Raises what `read` does."""
-    picture = _numbers_of_picture(path)
-    if picture.shape[:2] != mask.shape:
-        (h, w), (H, W) = picture.shape[:2], mask.shape
-        raise InputError(f'ps: "{path.name}" has {w} x {h} pixels, the mask {W} x {H}')
-    pixels = picture[mask]
-    if pixels.shape[1] in (2, 4):
-        pixels = pixels[:, :-1]
-    if pixels.shape[1] not in (1, 3):
-        raise InputError(f'ps: "{path.name}" has {pixels.shape[1]} channels, expected grey or colours')
-    if path.suffix.lower() in (".jpg", ".jpeg"):
-        pixels = srgb_to_linear(pixels)
-    return np.broadcast_to(pixels, (len(pixels), 3))
-
-
-def read_camera(folder: Path) -> np.ndarray | None:
-    """Intrinsic matrix, (3, 3), if the folder has one. Raises what `read` does."""
-    if not (folder / CAMERA).is_file():
-        return None
-    camera = _numbers(folder / CAMERA, 3)
-    check_camera(f"ps: {CAMERA}", camera)
-    return camera
-
-
-def _numbers_of_picture(path: Path) -> np.ndarray:
-    """(H, W, C), float32."""
-    try:
-        return read_picture(path)[0]
-    except (OSError, ValueError) as error:
-        raise type(error)(re.sub("^fit: ", "ps: ", str(error))) from None
-
-
-def _numbers(path: Path, columns: int) -> np.ndarray:
-    """A text file of numbers: (lines, columns)."""
-    if not path.is_file():
-        raise FileNotFoundError(f'ps: there is no file "{path}"')
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without numbers
-            rows = np.loadtxt(path, ndmin=2, encoding="utf-8")
-    except ValueError as error:
-        raise InputError(f"ps: {path.name}: {str(error).partition(';')[0]}") from None
-    if not rows.size:
-        raise InputError(f"ps: {path.name} is empty")
-    for k, row in enumerate(rows, 1):
-        if len(row) != columns or not np.isfinite(row).all():
-            raise InputError(f"ps: {path.name}, row {k}: expected {columns} finite numbers, got {row.tolist()}")
-    return rows
-
-
-def _truth(folder: Path, mask: np.ndarray) -> np.ndarray | None:
-    if (path := folder / "Normal_gt.exr").is_file():
-        normals = _numbers_of_picture(path)
-    elif (path := folder / "Normal_gt.mat").is_file():
-        from scipy.io import loadmat
-
-        try:
-            arrays = [a for name, a in loadmat(path).items() if not name.startswith("_")]
-        except (ValueError, TypeError, NotImplementedError) as error:
-            raise InputError(f"ps: cannot read {path.name}: {error}") from None
-        normals = next((a for a in arrays if np.ndim(a) == 3 and a.shape[2] == 3), None)
-    else:
-        return None
-    if normals is None or normals.shape != (*mask.shape, 3):
-        raise InputError(f"ps: {path.name} holds no normals of the size of the mask")
-    return unit(normals[mask].astype(np.float64))

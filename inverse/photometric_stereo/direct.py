@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from rimlight import ggx
@@ -173,17 +174,24 @@ class DirectModel(Lighting):
 
         turn : False holds the normals, and fits the rest.
         """
-        normals, albedo = own(guess.normals), own(guess.albedo)
-        base = None if guess.base is None else own(guess.base)
         exposures, bsdf = own(guess.exposures), bsdf_of(self.lobes, guess.weights)
-        for _ in range(steps):
-            pixel = _Pixel(self, normals, albedo, base, guess.base_eta)
-            sums = self._sums(pixel, exposures, bsdf)
-            normals, albedo, base = pixel.stepped(sums, free_albedo=free_albedo, turn=turn)
-        guess.normals = np.array(normals, np.float64).reshape(-1, 3)
-        guess.albedo = np.array(albedo, np.float64)
-        if base is not None:
-            guess.base = np.array(base, np.float64).reshape(-1, 3)
+        p, most = dr.arange(mi.UInt32, self.P), dr.opaque(mi.UInt32, steps)
+        normals, albedo = dr.gather(mi.Vector3f, own(guess.normals), p), dr.gather(mi.Float, own(guess.albedo), p)
+        linear = albedo if guess.base is None else dr.gather(mi.Color3f, own(guess.base), p)
+
+        def body(i, normals, linear):
+            pixel = _Pixel(self, guess.base_eta, normals, *((linear,) if guess.base is None else (albedo, linear)))
+            return i + 1, *pixel.stepped(self._sums(pixel, exposures, bsdf), free_albedo=free_albedo, turn=turn)
+
+        # A loop of Dr.Jit, for it takes longer to trace a step than to make it
+        begun = dr.zeros(mi.UInt32, self.P), normals, linear
+        _, normals, linear = dr.while_loop(begun, lambda i, *_: i < most, body, label="steps")
+        dr.eval(normals, linear)
+        guess.normals, found = np.array(normals, np.float64).T, np.array(linear, np.float64).T
+        if guess.base is None:
+            guess.albedo = found
+        else:
+            guess.base = found
 
     def _sums(self, pixel: _Pixel, exposures: mi.Float, bsdf: mi.BSDF) -> list[mi.Float]:
         """Over the lights, of what the equations of `_Pixel.stepped` are made: products of the two derivatives with
@@ -248,18 +256,20 @@ class DirectModel(Lighting):
         albedo = dr.gather(mi.Float, own(guess.albedo), p)
 
         def design(n: mi.Vector3f) -> tuple[np.ndarray, np.ndarray]:
-            """Of the lobes, (count K, B), and of what is a pixel's own, (count K,)."""
+            """Of the lobes, (count, K, B), and of what is a pixel's own, (count, K, 1)."""
             frame = mi.Frame3f(n)
             wo = frame.to_local(direction)
             factor = scale * dr.maximum(wo.z, 0)
             found = [f * factor * albedo for f in ggx.lobes(self.lobes, frame.to_local(view), wo)]
-            own_part = scale * diffuse(guess.base_eta, n, view, direction)
-            return np.array(found, np.float64).T, np.array(own_part, np.float64)
+            found.append(scale * diffuse(guess.base_eta, n, view, direction))
+            dr.eval(found)  # in one kernel: NumPy would ask for one array after the other
+            table = np.array(found, np.float64).T.reshape(count, self.K, B + 1)
+            return table[..., :B], table[..., B:]
 
-        base = None if guess.base is None else np.repeat(guess.base[pixels], self.K, axis=0)
+        base = None if guess.base is None else guess.base[pixels][:, None]
 
         def total(D: np.ndarray, g: np.ndarray) -> np.ndarray:
-            return D @ guess.weights + (0 if base is None else base * g[:, None])
+            return D @ guess.weights + (0 if base is None else base * g)
 
         frame = mi.Frame3f(normal)
         D, g = design(normal)
@@ -267,21 +277,21 @@ class DirectModel(Lighting):
         values, counts = dr.gather(mi.Color3f, self.values, entry), dr.gather(mi.Float, self.counts, entry)
         if self.indirect is not None:
             values -= dr.gather(mi.Color3f, self.indirect, entry)
-        values, counts = np.array(values, np.float64).T, np.array(counts, np.float64)
+        values = np.array(values, np.float64).T.reshape(count, self.K, -1)
+        counts = np.array(counts, np.float64).reshape(count, self.K)
         here = total(D, g)
-        counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(values - here, axis=1), 1e-20))
+        counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(values - here, axis=2), 1e-20))
         own_columns = [(total(*design(dr.normalize(normal + TURN * t))) - here) / TURN for t in (frame.s, frame.t)]
         own_columns = own_columns if turn else []
         if base is None:
             held = np.zeros_like(values)
         else:
-            own_columns += [g[:, None] * colour for colour in np.eye(3)]
-            held = base * g[:, None]
+            own_columns += [g * colour for colour in np.eye(3)]
+            held = base * g
         values -= held
         columns = np.stack(own_columns, -1) if own_columns else np.zeros((*values.shape, 0))
-        per_pixel = (a.reshape(count, self.K, *a.shape[1:]) for a in (D, columns, values, counts))
-        gram, moments, _ = without_turns(*per_pixel)
-        colours = values.shape[1]
+        gram, moments, _ = without_turns(D, columns, values, counts)
+        colours = values.shape[2]
         alpha, eta = np.array(self.lobes.alpha), np.array(self.lobes.eta)
         wanted = ~(np.isnan(alpha) & ~np.isnan(eta)) | coat
         if base is not None:  # a glaze reflects all colours alike
@@ -296,23 +306,22 @@ class DirectModel(Lighting):
 
 @dataclass
 class _Pixel:
-    """All pixels, each with what it has of its own, as one step of Gauss and Newton begins."""
+    """All pixels, each with what it has of its own, as one step of Gauss and Newton begins: normal, albedo, colour."""
 
     model: DirectModel
-    normals: mi.Float
-    albedo: mi.Float
-    colours: mi.Float | None
     base_eta: float
+    n: mi.Vector3f
+    a: mi.Float
+    base: mi.Color3f | None = None
 
     def __post_init__(self):
         self.number = p = dr.arange(mi.UInt32, self.model.P)
-        self.n, self.a = dr.gather(mi.Vector3f, self.normals, p), dr.gather(mi.Float, self.albedo, p)
-        self.base = None if self.colours is None else dr.gather(mi.Color3f, self.colours, p)
         self.point = dr.gather(mi.Point3f, self.model.points, p)
         self.view, self.frame = self.model.view(self.point), mi.Frame3f(self.n)
 
     def stepped(self, sums: list[mi.Float], *, free_albedo: bool, turn: bool) -> tuple:
-        """Normals, albedo and colours after a step, of `DirectModel._sums`. What is linear is eliminated."""
+        """Normals after a step, of `DirectModel._sums`; and albedo, or colours if there are any. What is linear is
+        eliminated."""
         uu, uv, vv, bu, bv, ll, *rest = sums
         count = 1 if self.base is None else 3
         lu, lv, lb = rest[:count], rest[count : 2 * count], rest[2 * count :]
@@ -330,14 +339,9 @@ class _Pixel:
         n = dr.select(dr.dot(n, v) > 1e-3, n, dr.normalize(n + away * v))
         linear = [(b - x.x * u - x.y * w) * inverse for b, u, w in zip(lb, lu, lv, strict=True)]
         linear = [dr.select(dr.isfinite(step), step, 0) for step in linear]  # no value of the pixel counts: as it is
-        albedo, base = self.a, None
         if self.base is None:
-            albedo = dr.clip(self.a + linear[0], *ALBEDOS)
-        else:
-            base = dr.ravel(dr.clip(self.base + mi.Color3f(*linear), 0, LIGHTEST))
-        result = dr.ravel(n), albedo, base
-        dr.eval(result)
-        return result
+            return n, dr.clip(self.a + linear[0], *ALBEDOS)
+        return n, dr.clip(self.base + mi.Color3f(*linear), 0, LIGHTEST)
 
 
 def diffuse(eta: float, n: mi.Vector3f, v: mi.Vector3f, direction: mi.Vector3f) -> mi.Float:
@@ -368,9 +372,11 @@ def without_turns(
     of_lobes = of_lobes.reshape(P, colours * B, len(diagonal))
     of_values = np.einsum("pkci,pkc->pi", counted, values)
     explained = np.linalg.solve(A, np.swapaxes(of_lobes, 1, 2))  # (P, T, C B)
-    gram = np.kron(np.eye(colours), np.tensordot(weighted, lobes, ((0, 1), (0, 1))))
+    # Pixel by pixel: along products so long and thin, threads of BLAS wait for each other again and again, which takes
+    # up to a hundred times as long on processors that have other work
+    gram = np.kron(np.eye(colours), (np.swapaxes(weighted, 1, 2) @ lobes).sum(0))
     gram -= np.tensordot(of_lobes, explained, ((0, 2), (0, 1)))
-    moments = np.tensordot(values, weighted, ((0, 1), (0, 1))).ravel() - np.tensordot(of_values, explained, 2)
+    moments = (np.swapaxes(values, 1, 2) @ weighted).sum(0).ravel() - np.tensordot(of_values, explained, 2)
     squares = (counts[..., None] * values**2).sum()
     return gram, moments, float(squares - (of_values * np.linalg.solve(A, of_values[..., None])[..., 0]).sum())
 
@@ -383,7 +389,7 @@ def simplex_least_squares(gram: np.ndarray, moments: np.ndarray, colours: int = 
     """
     size = np.sqrt(np.diag(gram)) + 1e-30
     root = np.linalg.cholesky(gram / size / size[:, None] + RIDGE * np.eye(len(moments))).T * size
-    target = np.linalg.solve(root.T, moments)
+    target = solve_triangular(root, moments, trans=1)
     # A black lobe of each colour takes what is left of 1
     heavy = 1e3 * np.linalg.norm(target) + 1e-30
     sums = np.kron(np.eye(colours), np.full((1, len(moments) // colours), heavy))

@@ -9,6 +9,7 @@ import numpy as np
 from rimlight.inverse.targets import srgb_to_linear
 
 from . import least_squares
+from .files import LINEAR
 from .vectors import LUMINANCE
 
 #: Pixels from which this is judged.
@@ -16,15 +17,15 @@ JUDGED = 2000
 
 #: Said of pictures that look so.
 ENCODED = (
-    "ps: the pictures have 8 bits, and look as if they were encoded as sRGB, but PNG is taken to be linear; "
+    "ps: the pictures have 8 bits, and look as if they were encoded as sRGB, but PNG and TIFF are taken to be linear; "
     "export them with 16 bits, linear, or as JPEG, which is decoded"
 )
 
 
 def looks_encoded(pictures: np.ndarray, names: Sequence[str], lights: np.ndarray, intensities: np.ndarray) -> bool:
-    """Do PNG of 8 bits fit a diffuse surface better if they are decoded from sRGB? pictures : (P, K, 3), as read, of
-    some pixels."""
-    if not len(pictures) or not all(name.lower().endswith(".png") for name in names) or not of_8_bits(pictures):
+    """Do PNG or TIFF of 8 bits fit a diffuse surface better if they are decoded from sRGB? pictures : (P, K, 3), as
+    read, of some pixels."""
+    if not len(pictures) or not all(name.lower().endswith(LINEAR) for name in names) or not of_8_bits(pictures):
         return False
     linear, decoded = misfits(pictures, lights, intensities)
     return decoded < linear

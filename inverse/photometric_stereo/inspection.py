@@ -14,7 +14,7 @@ from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.inverse.page import shrunk
 
-from . import cost, dataset, encoding, evidence, least_squares, start
+from . import cost, dataset, encoding, evidence, files, least_squares, start
 from .dataset import Dataset
 from .reconstruction import Options
 from .vectors import LUMINANCE, every
@@ -113,7 +113,7 @@ def inspect(folder: Path, options: Options | None = None) -> Inspection:
     largest, bright, black = (np.zeros(len(names)) for _ in range(3))
     mean, small = np.zeros((*mask.shape, 3), np.float32), []
     for k, name in enumerate(tqdm(names, desc="images", disable=None, leave=False)):
-        picture = dataset.read_pixels(folder / name, np.ones_like(mask)).reshape(*mask.shape, 3)
+        picture = files.read_pixels(folder / name, np.ones_like(mask)).reshape(*mask.shape, 3)
         inside, raw[:, k] = picture[mask], picture.reshape(-1, 3)[chosen]
         if not np.isfinite(inside).all():
             raise InputError(f'ps: "{name}" has values that are not finite; take these pixels out of the mask')
@@ -147,10 +147,12 @@ def inspect(folder: Path, options: Options | None = None) -> Inspection:
 def warnings(found: Inspection) -> list[str]:
     """What is wrong, or may be, with what to do about it, in sentences; the worst first."""
     said = []
+    if found.angles.min() >= 90:
+        said.append(f"The set will be refused, for {least_squares.BEHIND}.")
     if found.rank < 3:
         said.append(
             "The lights are all in one direction or in a plane: normals cannot be told, and the set will be refused. "
-            f"Check {dataset.DIRECTIONS}."
+            f"Check {files.DIRECTIONS}."
         )
     elif found.spread[0] > NARROW * found.spread[2]:
         said.append(
@@ -169,7 +171,7 @@ def warnings(found: Inspection) -> list[str]:
         )
     if found.misfits is not None and found.misfits[1] < found.misfits[0]:
         said.append(
-            "The pictures look like exports for the screen (sRGB), and PNG is taken to be linear: decoded from sRGB, "
+            "The pictures look like exports for the screen (sRGB), and PNG and TIFF are taken to be linear: decoded, "
             f"they fit a diffuse surface better ({100 * found.misfits[1]:.1f} % off instead of "
             f"{100 * found.misfits[0]:.1f} %). Export them linear with 16 bits, or as JPEG, which is decoded."
         )
@@ -237,8 +239,8 @@ def _estimates(sample: Dataset, options: Options) -> tuple[np.ndarray, np.ndarra
 
 
 def _misfits(raw: np.ndarray, setup: dataset.Setup) -> tuple[float, float] | None:
-    """Of PNG, under lights at infinity."""
-    if setup.near or not all(name.lower().endswith(".png") for name in setup.names):
+    """Of PNG and TIFF, under lights at infinity."""
+    if setup.near or not all(name.lower().endswith(files.LINEAR) for name in setup.names):
         return None
     return encoding.misfits(every(raw, encoding.JUDGED), setup.lights, setup.intensities)
 
@@ -255,25 +257,27 @@ def _of_images(found: Inspection) -> list[str]:
     if len(which := np.flatnonzero(found.black > BLACK)):
         said.append(
             f"More than {100 * BLACK:.0f} % of {listed(which)} is black: was the lamp on? If not, take its line out of "
-            f"{dataset.NAMES} and of the files of the lights."
+            f"{files.NAMES} and of the files of the lights."
         )
     if len(which := np.flatnonzero(np.abs(np.log(found.exposures)) > np.log(OFF))):
         said.append(
-            f"The exposure of {listed(which)} seems to be off what {dataset.INTENSITIES} says by more than "
+            f"The exposure of {listed(which)} seems to be off what {files.INTENSITIES} says by more than "
             f"{100 * (OFF - 1):.0f} %. That is estimated and put right by default: do not give --no-exposures."
         )
     return said
 
 
-def _bits(files: list[Path], raw: np.ndarray) -> str:
+def _bits(pictures: list[Path], raw: np.ndarray) -> str:
     """Of each channel, in words. The header of PNG tells them."""
-    kinds = {file.suffix.lower() for file in files}
+    kinds = {file.suffix.lower() for file in pictures}
     if kinds == {".exr"}:
         return "EXR, floating point"
+    if kinds <= {".tif", ".tiff"}:
+        return "TIFF" + ", 8 bits" * encoding.of_8_bits(raw)
     if kinds != {".png"}:
-        return "JPEG, 8 bits" if kinds <= {".jpg", ".jpeg"} else "of several formats"
+        return "JPEG, 8 bits" if kinds <= set(files.JPEG) else "of several formats"
     depths = set()
-    for file in files:
+    for file in pictures:
         with file.open("rb") as opened:
             depths.add(opened.read(25)[24])
     words = f"PNG, {' and '.join(map(str, sorted(depths)))} bits"

@@ -18,6 +18,9 @@ FEWEST, SPREAD = 4, 0.05
 #: Directions whose third singular value is less than this part of the first are taken to lie in a plane.
 PLANE = 1e-3
 
+#: Said of lights none of which shines on what the camera sees.
+BEHIND = "all lights are behind the object: z must point towards the camera; change the signs in light_directions.txt"
+
 #: Pixels that are treated at a time, for memory.
 BLOCK = 2**14
 
@@ -79,7 +82,10 @@ def brightest(values: np.ndarray, dark: float) -> np.ndarray:
 
 
 def check_lights(lights: np.ndarray) -> None:
-    """Raises ValueError if directions, (K, 3), lie in a plane, and so do not tell normals apart."""
+    """Raises ValueError if directions, (K, 3), lie in a plane, and so do not tell normals apart, or behind the
+    object."""
+    if lights[:, 2].max() <= 0:
+        raise InputError(f"ps: {BEHIND}")
     size = np.linalg.svd(lights, compute_uv=False)
     if size[2] < PLANE * size[0]:
         raise InputError(

@@ -72,12 +72,17 @@ class Progress:
         return best if best.beats(self.start) else self.start
 
     def _chosen(self, found: State) -> State:
-        """The better of the best of the trials and a state of the present one: another kind of material must be clearly
-        better."""
+        """The better of the best of the trials and a state of the present one. Another kind of material must be clearly
+        better than one that was fitted. The start was judged with the best of all kinds: beside it, what is more costs
+        nothing."""
         best = self.best
-        if best is None or (found.better_than(best) if found.kind == best.kind else found.needed_beside(best)):
+        if best is None:
             return found
-        return best
+        if best.start and not found.start:
+            better = found.beats(best)
+        else:
+            better = found.better_than(best) if found.kind == best.kind else found.needed_beside(best)
+        return found if better else best
 
 
 class Checkpoint:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
@@ -33,6 +34,9 @@ from .rendering import Rendering
 #: Alternations of each kind of material, from the best state of the simplest: with the normals of the start, anything
 #: may look like a coat. And at the largest size, of the same kind with a coat, or without: small pixels show it better.
 SETTLED, RECONSIDERED = 3, 2
+
+#: Longest path, as of the plugin `rig`.
+LONGEST = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,13 +100,19 @@ class Options:
             raise InputError(f'ps: "iterations" must be at least 1 each, got {self.iterations}')
         if not all(0 < r <= 1 and 1 / r == round(1 / r) for r in self.resolutions):
             raise InputError(f'ps: "resolutions" must be 1 or 1 over a whole number, got {self.resolutions}')
-        if not 0 <= self.dark < 1:
-            raise InputError(f'ps: "dark" must be in [0, 1), got {self.dark}')
-        if self.max_depth < 2 or self.spp < 1 or not 0 <= self.smoothing < np.inf:
-            raise InputError(
-                'ps: "max_depth" must be at least 2, "spp" 1 and "smoothing" 0, got '
-                f"{self.max_depth}, {self.spp}, {self.smoothing}"
-            )
+        ranges = {
+            "dark": (0 <= self.dark < 1, "in [0, 1)"),
+            "max_depth": (2 <= self.max_depth <= LONGEST, f"from 2 to {LONGEST}"),
+            "spp": (self.spp >= 1, "at least 1"),
+            "smoothing": (0 <= self.smoothing < np.inf, "at least 0"),
+            "tolerance": (0 <= self.tolerance < np.inf, "at least 0"),
+            "bilateral": (self.bilateral is None or 0 < self.bilateral < np.inf, "positive; 2 is usual"),
+            "brightness": (0 <= self.brightness < np.inf, "at least 0; 0.6 is usual"),
+            "seed": (self.seed >= 0, "at least 0"),
+        }
+        for name, (holds, wanted) in ranges.items():
+            if not holds:
+                raise InputError(f'ps: "{name}" must be {wanted}, got {getattr(self, name)}')
 
     def kinds(self) -> tuple[Kind, ...]:
         """Of material, that are tried."""
@@ -200,6 +210,8 @@ class Reconstruction:
     """A reconstruction under way; `now` says how far it is."""
 
     def __init__(self, data: Dataset, options: Options, *, after: Callable[[Result], None] | None = None):
+        if not mi.is_rgb or mi.is_polarized:
+            raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
         self.data, self.options, self.after = data, options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))

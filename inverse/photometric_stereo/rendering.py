@@ -139,6 +139,7 @@ class Rendering:
         # The camera sees points that move along its rays: no edge moves on the film
         rig = {"type": "rig", "rr_depth": 99, "sppp": 0}
         self.integrators = {d: mi.load_dict({**rig, "max_depth": d}) for d in {2, max_depth}}
+        self.bounces = mi.load_dict({**rig, "max_depth": max_depth, "min_depth": 3})
         self.fixed_shadows = mi.load_dict({**rig, "max_depth": max_depth, "sppi": 0})
 
     # ---------------------- Scene ----------------------
@@ -235,20 +236,15 @@ class Rendering:
 
     def image(self, *, spp: int, seed: int, max_depth: int | None = None) -> np.ndarray:
         """(P, K, 3)"""
-        return self._images(spp, seed, max_depth or self.max_depth)[self.data.mask]
+        return self._image(self.integrators[max_depth or self.max_depth], spp, seed)
 
     def indirect(self, *, spp: int, seed: int) -> np.ndarray:
-        """Of `image`, what has been reflected more than once: (P, K, 3). Equal seeds make the rest cancel."""
-        found = self.image(spp=spp, seed=seed)
-        direct = self._images(spp, seed, 2)
-        for k in range(found.shape[1]):  # these are the largest arrays of all
-            found[:, k] -= direct[:, :, k][self.data.mask]
-        return found
+        """Of `image`, what has been reflected more than once: (P, K, 3)."""
+        return self._image(self.bounces, spp, seed)
 
-    def _images(self, spp: int, seed: int, max_depth: int) -> np.ndarray:
-        """(H, W, K, 3), in Dr.Jit's memory."""
-        image = self.integrators[max_depth].render(self.scene, seed=seed, spp=spp)
-        return np.asarray(image).reshape(*self.data.mask.shape, -1, 3)
+    def _image(self, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
+        image = integrator.render(self.scene, seed=seed, spp=spp)
+        return np.asarray(image).reshape(*self.data.mask.shape, -1, 3)[self.data.mask]
 
     def gradient(
         self, adjoint: np.ndarray, *, spp: int, seed: int, depth: bool = False, adaptive: bool = False

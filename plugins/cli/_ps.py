@@ -111,6 +111,8 @@ class Run:
         """Exit code, and lines for people, of one data set."""
         if self._done():
             return 0, [f"finished already: {self.out / 'report.html'}"]
+        if self.out.resolve() == self.folder.resolve():
+            raise InputError(f'--out: "{self.out}" is the folder of the images; name another one')
         use_variant(self.variant)
         if self.threads:
             dr.set_thread_count(self.threads)

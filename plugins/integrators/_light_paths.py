@@ -156,11 +156,16 @@ class LightPaths:
 
     tracer : tells what camera rays meet, and how long paths are.
     per_path : see `LightByLight`.
+    min_depth : paths of fewer segments are left out.
     """
 
-    def __init__(self, tracer: PathTracer, lights: Lights, per_path: int):
-        self.tracer, self.lights, self.per_path = tracer, lights, per_path
+    def __init__(self, tracer: PathTracer, lights: Lights, per_path: int, min_depth: int = 0):
+        self.tracer, self.lights, self.per_path, self.min_depth = tracer, lights, per_path, min_depth
         self.scene, self.depths = tracer.scene, tracer.depths
+
+    def counts(self, depth: int) -> bool:
+        """Do paths of so many segments?"""
+        return depth >= self.min_depth
 
     def trace(
         self,
@@ -193,7 +198,7 @@ class LightPaths:
         pi = self.tracer.first_hit(ray, active) if pi is None else pi
         one, zero = (dr.full(mi.Spectrum, value, dr.width(u)) for value in (1, 0))
         place = Place(1, ray, pi, None, one, scale + zero, u, None, choice, horizon)
-        if area and not self.tracer.hide_emitters:
+        if area and not self.tracer.hide_emitters and self.counts(1):
             self._seen(to, scattering, place, active)
         active &= pi.is_valid()
         η = mi.Float(1)
@@ -202,7 +207,8 @@ class LightPaths:
             place = replace(place, throughput=wide(place.throughput, active), sample=sample)
             sampler.schedule_state()
             dr.eval(place, active)
-            to.direct(scattering, place, active)
+            if self.counts(place.number + 1):
+                to.direct(scattering, place, active)
             if not (area or self.depths.scatters(place.number + 1)):
                 break
             place, η, active = self._onwards(to, scattering, place, η, sampler, active)
@@ -226,7 +232,7 @@ class LightPaths:
         directions = scattering.directions_of(si, bsdf, active)
         emitted, onwards = scattering.sample_bsdf(si, bsdf, numbers, active, directions=directions)
         light = None
-        if scattering.any_hit_by_rays:
+        if scattering.any_hit_by_rays and self.counts(place.number + 1):
             y = onwards.pi.compute_surface_interaction(onwards.ray, mi.RayFlags.Minimal, active)
             light = scattering.number(y.emitter(self.scene))
         vertex = Vertex(place.ray, place.pi, place.number, place.throughput, η, mi.Bool(False), mi.Bool(False))

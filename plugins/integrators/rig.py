@@ -37,6 +37,11 @@ class RigIntegrator(EdgeIntegrator):
        - Longest path, in segments, as in ``path``: 1 shows emitters only, 2 adds direct illumination. From 0 to 16; a
          derivative keeps all vertices of its paths in memory. (Default: 2)
 
+     * - min_depth
+       - |int|
+       - Shortest path that counts, in segments: 3 leaves out direct illumination and visible emitters. For images only;
+         derivatives of such images are refused. (Default: 0, all)
+
      * - rr_depth
        - |int|
        - From this depth on, paths end at random ("Russian roulette"). (Default: 5)
@@ -112,19 +117,24 @@ class RigIntegrator(EdgeIntegrator):
             'max_depth': 3
     """
 
-    OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth", "lights_per_path")
+    OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "min_depth", "rr_depth", "lights_per_path")
     PLANES = False
     FROM_POINTS = False
     BALANCES = False
 
     def __init__(self, props: mi.Properties):
         who = props.plugin_name()
-        limits = {"max_depth": (2, 0, LONGEST), "rr_depth": (5, 1, None), "lights_per_path": (0, 0, None)}
+        limits = {
+            "max_depth": (2, 0, LONGEST),
+            "min_depth": (0, 0, None),
+            "rr_depth": (5, 1, None),
+            "lights_per_path": (0, 0, None),
+        }
         values = {key: _whole(who, props, key, *limit) for key, limit in limits.items()}
         super().__init__(props, max_depth=values["max_depth"], rr_depth=values["rr_depth"])
         if mi.is_spectral:
             raise InputError(f"{who}: spectral variants are not supported, got {mi.variant()}")
-        self.lights_per_path = values["lights_per_path"]
+        self.lights_per_path, self.min_depth = values["lights_per_path"], values["min_depth"]
         self.pixel_density: mi.Float | None = None
 
     # ---------------------- Mitsuba's interface ----------------------
@@ -169,6 +179,8 @@ class RigIntegrator(EdgeIntegrator):
 
     def _differentiate(self, scene, sensor, seed, spp, grad_in) -> Layers:
         """All terms, in forward mode, or given a gradient, in backward mode."""
+        if self.min_depth:
+            raise Refusal(f'{self.name}: derivatives are those of all light; leave out "min_depth" {self.min_depth}')
         forward = grad_in is None
         job = self.job(scene, sensor, seed, spp)
         paths = self._paths(scene)
@@ -271,7 +283,7 @@ class RigIntegrator(EdgeIntegrator):
         return lights
 
     def _paths(self, scene) -> LightPaths:
-        return LightPaths(self.TRACER(scene, self), self._lights(scene), self.lights_per_path)
+        return LightPaths(self.TRACER(scene, self), self._lights(scene), self.lights_per_path, self.min_depth)
 
     def _choice(self, sampler, seed) -> mi.Float | None:
         """Random numbers that choose lights, stratified over the samples of a pixel, or over neighbours."""

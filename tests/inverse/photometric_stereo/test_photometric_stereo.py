@@ -642,6 +642,24 @@ def test_near_lights() -> None:
     assert np.abs(found.depth / scene.depth - 1)[inner].max() < 0.005
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"brightness": -1.0}, '"brightness" must be at least 0; 0.6 is usual, got -1.0'),
+        ({"brightness": np.nan}, '"brightness" must be at least 0'),
+        ({"seed": -1}, '"seed" must be at least 0, got -1'),
+        ({"max_depth": 17}, '"max_depth" must be from 2 to 16, got 17'),
+        ({"tolerance": np.nan}, '"tolerance" must be at least 0'),
+        ({"bilateral": 0.0}, '"bilateral" must be positive'),
+        ({"dark": 1.0}, r'"dark" must be in \[0, 1\), got 1.0'),
+    ],
+    ids=str,
+)
+def test_options_out_of_range(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=f"ps: {message}"):
+        reconstruction.Options(**options)
+
+
 def test_descent_refuses_what_it_cannot() -> None:
     with pytest.raises(ValueError, match='"spp" of the descent must be at least 1'):
         refinement.Descent(spp=0)

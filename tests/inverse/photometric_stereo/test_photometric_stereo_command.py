@@ -440,6 +440,9 @@ def test_bad_folders(folder, result, tmp_path, capfd, monkeypatch):
     run = ["run", str(folder), "--out"]
     refused(capfd, ["run", str(tmp_path / "none"), "--out", str(tmp_path / "out")], "there is no folder")
     refused(capfd, [*run, str(result[0])], "holds a result already")
+    refused(capfd, [*run, str(folder)], "--out", "is the folder of the images")
+    refused(capfd, [*run, str(tmp_path / "out"), "--variant", "llvm_ad_spectral"], "three colours", "llvm_ad_rgb")
+    mi.set_variant("llvm_ad_rgb")
     refused(capfd, ["simulate", str(folder)], "holds a data set already")
     (tmp_path / "file").write_text("mine")
     refused(capfd, [*run, str(tmp_path / "file" / "out")], "--out", "is not a folder")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from photometric import LAMBERT, UP, disc, glossy
 from PIL import Image
+from skimage import io
 
 from rimlight import ggx
 from rimlight.cli import main
@@ -145,12 +146,84 @@ def test_pictures_become_linear(tmp_path: Path, suffix: str, encode: Callable, t
 
 def test_grey_pictures(tmp_path: Path) -> None:
     grey = lambda c: np.round(c[:1] * 65535).astype(np.uint16)
-    found = pictures(tmp_path, COLOURS, ".png", grey)
-    np.testing.assert_allclose(found.values[7], np.repeat(COLOURS[:, :1], 3, 1), atol=1e-5)
+    colours = np.maximum(COLOURS, 0.01)  # black images would be left out
+    found = pictures(tmp_path, colours, ".png", grey)
+    np.testing.assert_allclose(found.values[7], np.repeat(colours[:, :1], 3, 1), atol=1e-5)
 
 
-def replaced(name: str, text: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).write_text(text)
+@pytest.mark.parametrize(("suffix", "of"), [(".tif", np.uint16), (".tiff", np.float32)])
+def test_tiff(tmp_path: Path, suffix: str, of: type) -> None:
+    """What developers of raw pictures write: linear. Also without a list of names."""
+    data = small()
+    dataset.write(tmp_path, data)
+    (tmp_path / dataset.NAMES).unlink()
+    whole = 65535 if of is np.uint16 else 1
+    for k, colour in enumerate(COLOURS):
+        (tmp_path / f"{'abcd'[k]}.exr").unlink()
+        picture = np.broadcast_to(colour * whole, (*data.mask.shape, 3)).astype(of)
+        io.imsave(tmp_path / f"{k}{suffix}", picture, check_contrast=False)
+    np.testing.assert_allclose(dataset.read(tmp_path).values[3] * data.intensities, COLOURS, atol=1e-5)
+
+
+def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
+    """Pictures that no file lists belong to the lights in this order."""
+    for name in ("img10.png", "img2.png", "img1.png", "2 b.exr", "mask.png", "b1.jpg"):
+        (tmp_path / name).touch()
+    assert dataset.read_names(tmp_path) == ["2 b.exr", "b1.jpg", "img1.png", "img2.png", "img10.png"]
+
+
+@pytest.mark.parametrize("separator", [" ", ",", ", ", ";", "\t"])
+def test_tables_of_other_programs(tmp_path: Path, separator: str) -> None:
+    """With marks of byte order, line ends of Windows, and comments."""
+    data = small()
+    dataset.write(tmp_path, data)
+    rows = [separator.join(map(str, row)) for row in data.lights]
+    table = "\r\n".join(["# x y z", *rows[:2], "", *rows[2:]])
+    (tmp_path / dataset.DIRECTIONS).write_bytes(table.encode("utf-8-sig"))
+    (tmp_path / dataset.NAMES).write_bytes("\r\n".join([*data.names, ""]).encode("utf-8-sig"))
+    found = dataset.read(tmp_path)
+    np.testing.assert_allclose(found.lights, data.lights, atol=1e-12)
+    assert found.names == data.names
+
+
+MASKS = {
+    "green": lambda m: Image.fromarray(np.stack([0 * m, m, 0 * m], -1)),
+    "colours and alpha": lambda m: Image.fromarray(np.stack([0 * m + 99, m, m, 0 * m + 255], -1)),
+    "cut out": lambda m: Image.fromarray(np.stack([255 - m, 0 * m, 0 * m, m], -1)),
+    "grey, cut out": lambda m: Image.fromarray(np.stack([0 * m + 9, m], -1)),
+    "numbers of parts": lambda m: Image.fromarray(m // 255 * 3),
+}
+
+
+@pytest.mark.parametrize("kind", MASKS)
+def test_masks_of_other_programs(tmp_path: Path, kind: str) -> None:
+    mask = small().mask
+    MASKS[kind](mask.astype(np.uint8) * 255).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(dataset.read_mask(tmp_path / "mask.png"), mask)
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_black_images_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture, near: bool) -> None:
+    data = small(near)
+    dataset.write(tmp_path, data)
+    write_exr(tmp_path / "a.exr", {"": np.zeros((*data.mask.shape, 3), np.float32)})
+    found, rest = dataset.read(tmp_path), [0, 2, 3]
+    assert caplog.messages == ["ps: black in the mask, and left out: a.exr; were these lamps on?"]
+    assert found.names == ("b.exr", "d.exr", "c.exr")
+    np.testing.assert_allclose(found.values, data.values[:, rest], rtol=1e-6)
+    np.testing.assert_allclose(found.intensities, data.intensities[rest])
+    assert [str(light) for light in found.lights] == [str(data.lights[k]) for k in rest]
+
+
+def test_lights_behind_the_object_are_refused() -> None:
+    lights = np.array([[0, 0.6, -0.8], [0.6, 0, -0.8], [0, 0, -1]])
+    with pytest.raises(ValueError, match="ps: all lights are behind the object: z must point towards the camera"):
+        least_squares.check_lights(lights)
+    least_squares.check_lights(lights * [1, 1, -1])
+
+
+def replaced(name: str, text: str, encoding: str = "utf-8") -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_text(text, encoding=encoding)
 
 
 def without(name: str) -> Callable[[Path], None]:
@@ -163,6 +236,16 @@ def picture(name: str, *shape: int, value: float = 1.0) -> Callable[[Path], None
 
 def black_mask(folder: Path) -> None:
     Image.fromarray(np.zeros((6, 7), np.uint8)).save(folder / "mask.png")
+
+
+def layers_without_a_picture(folder: Path) -> None:
+    layer = np.ones((6, 7, 3), np.float32)
+    write_exr(folder / "a.exr", {"albedo": layer, "beauty": layer})
+
+
+def printed(folder: Path) -> None:
+    Image.new("CMYK", (7, 6)).save(folder / "a.jpg")
+    (folder / "filenames.txt").write_text("a.jpg\nb.exr\nc.exr\nd.exr")
 
 
 THREE = "0 0 1\n" * 3
@@ -184,9 +267,15 @@ THREE = "0 0 1\n" * 3
         (replaced("light_intensities.txt", "1 1 1\n" * 3 + "1 0 1"), False, "light 4 has no intensity"),
         (without("light_directions.txt"), False, 'ps: there is no file ".*light_directions.txt"'),
         (replaced("light_directions.txt", ""), False, "ps: light_directions.txt is empty"),
-        (replaced("light_directions.txt", "0 0 1\n0 0\n"), False, "columns changed from 3 to 2 at row 2"),
-        (replaced("light_directions.txt", "0 0 1\n0 nan 1\n"), False, "row 2: expected 3 finite numbers"),
-        (replaced("light_directions.txt", "0 0 1\n0 x 1\n"), False, "ps: light_directions.txt: could not convert"),
+        (replaced("light_directions.txt", "0 0 1\n0 0\n"), False, 'line 2: expected 3 finite numbers, got "0 0"$'),
+        (replaced("light_directions.txt", "0 0 1\n0 nan 1\n"), False, "line 2: expected 3 finite numbers"),
+        (replaced("light_directions.txt", "x y z\n0 0 1\n"), False, 'line 1: .* got "x y z"; take a header away'),
+        (replaced("light_directions.txt", "0 0 1\n", "utf-16"), False, "light_directions.txt is not text in UTF-8"),
+        (replaced("filenames.txt", "bühne.exr\n", "latin-1"), False, "ps: filenames.txt is not text in UTF-8"),
+        (replaced("filenames.txt", "a.exr\nb.exr\na.exr\n"), False, 'ps: filenames.txt lists "a.exr" twice'),
+        (replaced("filenames.txt", "a.bmp\nb.exr\nc.exr\nd.exr"), False, 'ps: "a.bmp" is of a format that is not read'),
+        (layers_without_a_picture, False, 'ps: "a.exr" has the layers albedo, beauty, and which of them'),
+        (printed, False, 'ps: "a.jpg" is printed in four colours'),
         (replaced("light_directions.txt", "0 0 1\n0 0 0\n" * 2), False, "light_directions.txt, line 2: the direction"),
         (replaced("K.txt", "1 0 0\n0 1 0\n"), False, "ps: K.txt: the camera must be a matrix"),
         (replaced("K.txt", "-9 0 0\n0 9 0\n0 0 1"), False, "ps: K.txt: the camera must be a matrix"),

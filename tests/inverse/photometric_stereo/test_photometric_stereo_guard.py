@@ -25,6 +25,7 @@ from rimlight.inverse.photometric_stereo import (
     dataset,
     least_squares,
     output,
+    progress,
     report,
     simulation,
     start,
@@ -379,3 +380,20 @@ def test_disk_full_names_the_file(tmp_path: Path) -> None:
     ):
         raise OSError(28, "No space left on device")
     assert not list(tmp_path.iterdir())
+
+
+def test_beside_the_start_no_material_costs_more() -> None:
+    """It was judged with the best of all. Beside a material that was fitted, and is worse than the start, another one
+    need not be clearly better than the start."""
+    state = lambda left_out, halves, **what: alternation.State(
+        None, None, what.pop("kind", Kind()), left_out=left_out, halves=halves, curl=13.0, **what
+    )
+    begun, several = state(0.0869, 9.01, start=True), Kind(several=True)
+    now = progress.Progress(kind=Kind(), start=begun)
+    now.end_trial(begun)
+    now.end_trial(state(0.0898, 8.03))
+    assert now.best is begun
+    now.end_trial(state(0.0820, 8.06, kind=several))
+    assert now.best.kind == now.best_so_far().kind == several
+    now.end_trial(state(0.0815, 7.54, uncertain=0.0046, kind=Kind(True, True)))
+    assert now.best.kind == several

@@ -180,6 +180,22 @@ def test_discs_have_layers_of_their_own():
         assert np.mean(z**2) < 1.3
 
 
+@pytest.mark.parametrize("lights", [small_lights, all_kinds])
+def test_short_paths_are_left_out(lights):
+    """What is left are the longer ones, with the same random numbers, also of emitters that rays hit."""
+    scene = room(lights(), rough=True)
+    image = lambda **options: np.array(rig(**options).render(scene, spp=16, seed=1))
+    whole = image(max_depth=4)
+    np.testing.assert_allclose(image(max_depth=4, min_depth=1), whole, atol=1e-6 * whole.max())
+    for longest in (1, 2):
+        rest = image(max_depth=4, min_depth=longest + 1)
+        assert rest.max() > 0.01
+        np.testing.assert_allclose(rest, whole - image(max_depth=longest), atol=1e-5 * whole.max())
+    assert not image(max_depth=2, min_depth=3).any()
+    with pytest.raises(RuntimeError, match=r'rig: derivatives are those of all light; leave out "min_depth" 3'):
+        derivative_image(scene, rig(max_depth=4, min_depth=3), Motion(scene, **COLOUR), spp=1)
+
+
 def test_monochrome():
     scene = room(small_lights())
     rgb = np.array(mi.render(scene, integrator=rig(), spp=64, seed=1))
@@ -386,6 +402,7 @@ def test_names_of_shapes_that_emit():
         ({"max_depth": -1}, '"max_depth" must be a whole number from 0 to 16, got -1'),
         ({"max_depth": 17}, '"max_depth" must be a whole number from 0 to 16, got 17'),
         ({"max_depth": 2.0}, '"max_depth" must be a whole number from 0 to 16, got 2.0'),
+        ({"min_depth": -1}, '"min_depth" must be a whole number >= 0, got -1'),
         ({"rr_depth": 0}, '"rr_depth" must be a whole number >= 1, got 0'),
         ({"lights_per_path": -1}, '"lights_per_path" must be a whole number >= 0, got -1'),
         ({"sppp": -4}, '"sppp" must be a whole number >= 0, got -4'),
