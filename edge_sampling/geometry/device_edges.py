@@ -30,7 +30,7 @@ BESIDE_MASK = 2
 BESIDE_LINE = 1.25, 8
 
 #: And beside sharp edges, in units of `beside_edge`, times the cotangent of the angle between the faces, but at most so
-#: large a cotangent. Closer, rays meet both faces at the same distance, up to rounding, and often the one that faces away.
+#: large a cotangent. Closer, rays meet both faces at the same distance, up to rounding, often the one that faces away.
 BESIDE_SHARP = 0.5, 1000
 
 #: Which meshes glass and masks are.
