@@ -87,16 +87,43 @@ def reflected_ball(apart: bool = False) -> mi.Scene:
     return scene(sensor=camera((0.6, 1.6, -3.4), (0.1, 0.6, 0)), **room(), **shapes)
 
 
-def stretched_ball() -> mi.Scene:
-    """A smooth-shaded ball with a picture, which its instance stretches: normals and texture move over it."""
-    vertices, _, uv, faces = ball(32)
-    texels = np.random.default_rng(3).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
-    picture = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
-    inside = mesh("ball", vertices, faces, True, uv, bsdf={"type": "diffuse", "reflectance": picture})
+def stretched_ball(kind: str = "bilinear", n: int = 32, apart: bool = False) -> mi.Scene:
+    """A smooth-shaded ball with a picture, which its instance stretches: normals and texture move over it.
+
+    kind : of the picture, see `pictured`. apart : as a mesh.
+    """
+    vertices, _, uv, faces = ball(n)
+    inside = mesh("ball", vertices, faces, True, uv, bsdf=pictured(kind))
     to_world = mi.ScalarTransform4f().translate([0.1, 0.7, 0]).rotate([0.3, 1, 0.2], 30).scale([0.7, 0.4, 0.5])
-    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
-    group = {"type": "shapegroup", "ball": inside}
-    return scene(sensor=camera((0.6, 1.6, -3.4), (0.1, 0.6, 0)), **room(), group=group, thing=instance)
+    shapes: dict[str, Any] = {
+        "group": {"type": "shapegroup", "ball": inside},
+        "thing": {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world},
+    }
+    if apart:
+        placed = [list(to_world @ mi.ScalarPoint3f(*v)) for v in vertices]
+        thing: Any = mesh("thing", placed, faces, True, uv, bsdf=pictured(kind))
+        normals = np.reshape(mi.traverse(inside)["vertex_normals"], (-1, 3)).tolist()
+        params = mi.traverse(thing)
+        params["vertex_normals"] = np.ravel([list(to_world @ mi.ScalarNormal3f(*n)) for n in normals])
+        params.update()
+        shapes = {"thing": thing}
+    return scene(sensor=camera((0.6, 1.6, -3.4), (0.1, 0.6, 0)), **room(), **shapes)
+
+
+def pictured(kind: str) -> dict[str, Any]:
+    """A matt material with a picture: of colours, ``bilinear`` or ``nearest``, or a ``checkerboard``; of heights,
+    ``bumpmap``; or of opacity, ``mask``."""
+    numbers = np.random.default_rng(3).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
+    picture = lambda texels, of: {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": of}
+    if kind == "bumpmap":
+        heights = picture(numbers[..., :1], "bilinear")
+        return {"type": "bumpmap", "heights": heights, "scale": 0.15, "bsdf": diffuse(0.7)}
+    if kind == "mask":
+        return {"type": "mask", "opacity": picture(numbers[..., :1], "nearest"), "bsdf": diffuse(0.7, two_sided=True)}
+    if kind == "checkerboard":
+        squares = {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale([8, 5, 1])}
+        return {"type": "diffuse", "reflectance": squares}
+    return {"type": "diffuse", "reflectance": picture(numbers, kind)}
 
 
 SLIDE = {"key": "chair1.to_world", "direction": [1, 0.2, 0.4]}
@@ -107,4 +134,10 @@ INSTANCES: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "chair_slides": (chairs, SLIDE, 4e-3, 2),
     "chair_turns": (chairs, TURN, 8e-3, 2),
     "stretched_ball": (stretched_ball, {"key": "thing.to_world", "rotate": [1, 0.4, 0.7]}, 6e-3, 2),
+    "checkered_instance": (
+        lambda: stretched_ball("checkerboard", 12),
+        {"key": "thing.to_world", "rotate": [1, 0.4, 0.7], "pivot": [0.1, 0.7, 0]},
+        4e-3,
+        2,
+    ),
 }

@@ -249,7 +249,7 @@ class FilmBoundary:
         ulps = dr.select(chosen.is_curve, 8, 2) * ulp if self.outlines.curves is not None else 2 * ulp
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         in_world = ulps * largest
-        if self.outlines.edges is not None and self.outlines.edges.any_farther:
+        if self.outlines.edges is not None:
             viewer = projection.viewer(at.aperture_sample)
             to_viewer = mi.Vector3f(viewer) if projection.orthographic else viewer - p
             farther = self.outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)

@@ -106,7 +106,7 @@ class EdgeTree:
     groups : indices into `edges`, a tree for each; without the empty ones.
     """
 
-    _NUMBERS = ("leaf_size", "depths", "bottoms", "device_node_offsets", "device_leaf_offsets")
+    _NUMBERS = ("leaf_size", "leaves", "bottoms", "device_node_offsets", "device_leaf_offsets")
     DRJIT_STRUCT = dict.fromkeys(  # for `dr.freeze`
         ("device_edges", "centre", "slot_edge", "_used", "_open", "nodes", "slots", *_NUMBERS)
     )
@@ -120,29 +120,29 @@ class EdgeTree:
         centres = ends[:, 0] + edges.part[:, 0].mean(1, keepdims=True) * (ends[:, 1] - ends[:, 0])
         # Opaque, like the offsets below: scenes that differ in numbers only share their kernels.
         self.centre = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in np.median(centres, axis=0)))
-        slots, self.depths, leaf_size = [], [], 0
+        slots, self.leaves, leaf_size = [], [], 0
         self.node_offsets, self.leaf_offsets = [0], [0]
         for group in groups:
             order = _order(centres[group])
             slots.append(np.where(order < 0, -1, group[order]))
             leaves = len(order)
             leaf_size = max(leaf_size, int((order >= 0).sum(1).max()))
-            self.depths.append(leaves.bit_length() - 1)
+            self.leaves.append(leaves)
             self.node_offsets.append(self.node_offsets[-1] + 2 * leaves)
             self.leaf_offsets.append(self.leaf_offsets[-1] + leaves)
         opaque = lambda numbers: [dr.opaque(mi.UInt32, x) for x in numbers]
         self.leaf_size = dr.opaque(mi.UInt32, leaf_size)
-        self.bottoms = opaque(1 << depth for depth in self.depths)
+        self.bottoms = opaque(self.leaves)
         self.device_node_offsets, self.device_leaf_offsets = map(opaque, (self.node_offsets, self.leaf_offsets))
         slot = np.concatenate(slots).reshape(-1)
         self.slot_edge = mi.UInt32(np.maximum(slot, 0).astype(np.uint32))
         self._used = mi.Bool(slot >= 0)
         self._open = mi.Bool(edges.count[np.maximum(slot, 0)] != 2)
-        # An array for each packet: several scatters to one array would be as many kernels.
-        self.nodes = [dr.zeros(mi.Float, self.node_offsets[-1] * 4) for _ in range(NODE_PACKETS)]
-        self.slots = [dr.zeros(mi.Float, self.leaf_offsets[-1] * LEAF * 4) for _ in range(SLOT_PACKETS)]
+        #: An array for each packet: several scatters to one array would be as many kernels.
+        self.nodes = _zeros(NODE_PACKETS, self.node_offsets[-1])
+        self.slots = _zeros(SLOT_PACKETS, self.leaf_offsets[-1] * LEAF)
         # Of the time that the refit of a small tree takes, 95 % are for tracing the same program again.
-        self._recorded = dr.freeze(EdgeTree._refit)
+        self._recorded = dr.freeze(EdgeTree._fitted)
 
     @property
     def bytes(self) -> int:
@@ -165,25 +165,38 @@ class EdgeTree:
     def refit(self, positions: mi.Float) -> None:
         """Follow the vertices to `positions`, (3 V,), world space; detached."""
         if dr.flag(dr.JitFlag.FreezingScope):
-            self._refit(positions)  # as a part of what is being recorded
-        else:
-            with no_collection():
-                self._recorded(self, positions)
+            self.nodes, self.slots = self._fitted(positions)  # as a part of what is being recorded
+            return
+        # What there was would be an argument, and stay in memory beside what comes.
+        self.nodes, self.slots = [], []
+        with no_collection():
+            self.nodes, self.slots = self._recorded(self, positions)
 
-    def _refit(self, positions: mi.Float) -> None:
+    def _fitted(self, positions: mi.Float) -> tuple[list[mi.Float], list[mi.Float]]:
+        """Nodes and slots for these positions."""
         with dr.suspend_grad():
             slot = dr.arange(mi.UInt32, dr.width(self.slot_edge))
-            _scatter(self.slots, slot, self._slots_of(positions, slot).pack())
-            for depth, nodes, leaves in zip(self.depths, self.node_offsets, self.leaf_offsets, strict=False):
-                # Opaque offsets: all levels share one kernel.
-                first, offset = dr.opaque(mi.UInt32, 2**depth + nodes), dr.opaque(mi.UInt32, leaves * LEAF)
-                leaf = dr.arange(mi.UInt32, 2**depth)
-                _scatter(self.nodes, leaf + first, self._leaf(leaf * LEAF + offset).pack())
-                for level in reversed(range(depth)):
-                    first, offset = (dr.opaque(mi.UInt32, k * 2**level + nodes) for k in (1, 2))
-                    i = dr.arange(mi.UInt32, 2**level)
-                    pair = [Node.unpack(_gather(self.nodes, 2 * i + offset + k)) for k in (0, 1)]
-                    _scatter(self.nodes, i + first, _merge(*pair).pack())
+            slots = _packed(self._slots_of(positions, slot))
+            levels: list[list[mi.Float]] = []
+            for leaves, first in zip(self.leaves, self.leaf_offsets, strict=False):
+                levels += self._levels(slots, leaves, first)
+            return [dr.concat(list(packets)) for packets in zip(*levels, strict=True)], slots
+
+    def _levels(self, slots: list[mi.Float], leaves: int, first: int) -> list[list[mi.Float]]:
+        """The nodes of one tree, from the first level to the leaves. Each level is an array of its own: Dr.Jit would
+        copy one that has all of them before it writes each next level."""
+        # Opaque offsets: all levels share one kernel.
+        below = _packed(self._leaf(slots, LEAF * (dr.arange(mi.UInt32, leaves) + dr.opaque(mi.UInt32, first))))
+        levels, start = [below], leaves
+        for level in reversed(range((leaves - 1).bit_length())):
+            begin, end = 2**level, min(2 ** (level + 1), leaves)
+            child = 2 * dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, 2 * begin - start)
+            merged = _packed(_merge(*(Node.unpack(_gather(below, child + k)) for k in (0, 1))))
+            levels.insert(0, merged)
+            # Of the last level but one, the rest are leaves.
+            below = merged if end == 2 * begin else [dr.concat(list(p)) for p in zip(merged, below, strict=True)]
+            start = begin
+        return [_zeros(NODE_PACKETS, 1), *levels]
 
     def _slots_of(self, positions: mi.Float, slot: mi.UInt32) -> Slot:
         device_edges = self.device_edges
@@ -206,8 +219,8 @@ class EdgeTree:
         crease = dr.select(usable & ~always, crease, 0)
         return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), mi.Float(always & usable), crease)
 
-    def _leaf(self, first: mi.UInt32) -> Node:
-        nodes = [self._single(self.slot(first + k)) for k in range(LEAF)]
+    def _leaf(self, slots: list[mi.Float], first: mi.UInt32) -> Node:
+        nodes = [self._single(Slot.unpack(_gather(slots, first + k))) for k in range(LEAF)]
         while len(nodes) > 1:
             nodes = [_merge(p, q) for p, q in zip(nodes[::2], nodes[1::2], strict=True)]
         return nodes[0]
@@ -267,33 +280,59 @@ def _gather(sources: list[mi.Float], index: mi.UInt32, active: mi.Bool | bool = 
     return [dr.gather(mi.Vector4f, source, index, active) for source in sources]
 
 
-def _scatter(targets: list[mi.Float], index: mi.UInt32, packets: list[mi.Vector4f]) -> None:
-    for target, packet in zip(targets, packets, strict=True):
-        dr.scatter(target, packet, index)
-    dr.eval(targets)
+def _zeros(packets: int, count: int) -> list[mi.Float]:
+    return [dr.zeros(mi.Float, 4 * count) for _ in range(packets)]
+
+
+def _packed(what: Node | Slot) -> list[mi.Float]:
+    packed = [dr.ravel(packet) for packet in what.pack()]
+    dr.eval(packed)
+    return packed
 
 
 # ---------------------- Order ----------------------
 
 
 def _order(centres: np.ndarray) -> np.ndarray:
-    """Edges of each leaf: (leaves, LEAF), indices into `centres`, -1 for none; `leaves` is a power of two."""
+    """Edges of each leaf: (leaves, LEAF), indices into `centres`, -1 for none. Leaf k is node number `leaves` + k."""
     n = len(centres)
-    leaves = 1 << max(0, int(np.ceil(np.log2(n / LEAF))))
+    leaves = -(-n // LEAF)
     size = -(-n // leaves)
     order = np.full(leaves * size, -1)
     order[:n] = np.arange(n)
     # What fills up sorts to the end.
     padded = np.concatenate([centres, np.full((1, 3), np.nan)]).astype(np.float32)
-    width = leaves * size
-    while width > size:
-        order = order.reshape(-1, width)
-        c = padded[order]
-        with np.errstate(invalid="ignore"):
-            extent = np.fmax.reduce(c, axis=1) - np.fmin.reduce(c, axis=1)
-        axis = np.nan_to_num(extent, nan=-1.0).argmax(1)
-        key = np.take_along_axis(c, axis[:, None, None], axis=2)[..., 0]
-        order = np.take_along_axis(order, np.argpartition(key, width // 2, axis=1), axis=1)
-        width //= 2
-    order = order.reshape(leaves, size)
+    order = _from_left_to_right(padded, order[None], leaves)
+    # Leaves of the last level come after those of the last level but one.
+    order = np.roll(order.reshape(leaves, size), -_in_last_level(leaves), axis=0)
     return np.concatenate([order, np.full((leaves, LEAF - size), -1)], axis=1)
+
+
+def _from_left_to_right(centres: np.ndarray, order: np.ndarray, leaves: int) -> np.ndarray:
+    """Halve sets of edges until they are leaves, and return these from left to right: of (sets, edges), in so many
+    leaves each, (sets * leaves, edges of a leaf)."""
+    while leaves > 1:
+        half = 1 << (leaves - 1).bit_length() - 1
+        left = (half + min(_in_last_level(leaves), half)) // 2
+        where = left * (order.shape[1] // leaves)
+        order = _parted(centres, order, where)
+        if 2 * left != leaves:
+            sides = (order[:, :where], left), (order[:, where:], leaves - left)
+            return np.concatenate([_from_left_to_right(centres, *side) for side in sides])
+        order, leaves = order.reshape(2 * len(order), -1), left
+    return order
+
+
+def _parted(centres: np.ndarray, order: np.ndarray, where: int) -> np.ndarray:
+    """Each set of edges, such that no edge before `where` is beyond one after it, along its longest side."""
+    c = centres[order]
+    with np.errstate(invalid="ignore"):
+        extent = np.fmax.reduce(c, axis=1) - np.fmin.reduce(c, axis=1)
+    axis = np.nan_to_num(extent, nan=-1.0).argmax(1)
+    key = np.take_along_axis(c, axis[:, None, None], axis=2)[..., 0]
+    return np.take_along_axis(order, np.argpartition(key, where, axis=1), axis=1)
+
+
+def _in_last_level(leaves: int) -> int:
+    """How many of the leaves of a complete tree are in its last level."""
+    return 2 * leaves - (1 << (leaves - 1).bit_length())

@@ -47,7 +47,7 @@ def sample_edge(
     EdgeSample, (N,)
     """
     descent = _choose_group(tree, view, use, mi.Float(choice), mi.Bool(active))
-    if max(tree.depths) > 0:
+    if max(tree.leaves) > 1:
         descent = _down_to_a_leaf(tree, view, descent, sampler)
     return _edge_of_the_leaf(tree, view, descent, sampler)
 
@@ -78,7 +78,7 @@ def _choose_group(tree: EdgeTree, view: View, use, choice: mi.Float, active: mi.
     for k, preference in enumerate(use):
         weight = mi.Float(preference)
         # A few edges are tested faster than their node.
-        if len(use) > 1 and max(tree.depths) > 0:
+        if len(use) > 1 and max(tree.leaves) > 1:
             weight *= importance(tree.node(tree.device_node_offsets[k] + 1), view)
         total += weight
         p = dr.select(total > 0, weight / total, 0)

@@ -205,7 +205,7 @@ class Silhouettes:
     ) -> mi.Float:
         """How far beside a point p that was sampled to look from x: scene units."""
         aside = beside_edge(p, x)
-        if self.tree is None or not self.tree.device_edges.any_farther:
+        if self.tree is None:
             return aside
         active = sample.edge < self.count
         edge = dr.select(active, sample.edge, 0)

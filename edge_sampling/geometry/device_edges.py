@@ -29,6 +29,10 @@ BESIDE_MASK = 2
 #: cotangent of the angle between both, beyond which rays start below it, but at most the second number.
 BESIDE_LINE = 1.25, 8
 
+#: And beside sharp edges, in units of `beside_edge`, times the cotangent of the angle between the faces, but at most so
+#: large a cotangent. Closer, rays meet both faces at the same distance, up to rounding, often the one that faces away.
+BESIDE_SHARP = 0.5, 1000
+
 #: Which meshes glass and masks are.
 KINDS = bends_light, lets_rays_through
 
@@ -41,7 +45,7 @@ class DeviceEdges:
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
     _OF_EDGES = ("_ends", "_part", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
-    _ANY = ("any_smooth", "any_farther", "_any_lines", "_any_split", "_any_joined", "_any_through", "_first_line")
+    _ANY = ("any_smooth", "_any_lines", "_any_split", "_any_joined", "_any_through", "_first_line")
     DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", "_lines", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
@@ -59,8 +63,6 @@ class DeviceEdges:
         self._is_line = mi.Bool(np.array(edges.is_line))
         glass, mask = (np.array([is_so(m) for m in geometry.meshes] or [False])[edges.mesh].any(1) for is_so in KINDS)
         self._glass, self._mask = mi.Bool(glass & ~edges.is_line), mi.Bool(mask & ~edges.is_line)
-        #: Is there an edge beside which `farther` is not 0?
-        self.any_farther = bool((glass | mask | edges.is_line | edges.joined).any())
         #: Are there lines in which shapes cut through each other?
         self._any_lines = bool(edges.is_line.any())
         self._lines = geometry.lines if self._any_lines else ()
@@ -246,6 +248,9 @@ class DeviceEdges:
         else:
             wedge *= BEHIND
         farther = wedge * lift(scene, p) + self._crack(positions, edge)
+        margin, most = BESIDE_SHARP
+        sharp = dr.select(of(self._two_faces), dr.clip(cotangent, 0, most), 0)
+        farther += dr.select(sharp > 0, margin * sharp * beside_edge(p, p + to_viewer), 0)
         return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
 
     def _overhang(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:

@@ -170,14 +170,21 @@ def surface_met(
 ) -> mi.SurfaceInteraction3f:
     """What a ray meets, attached to the motion of instances, too.
 
-    Mitsuba 3.9 knows how the points of an instance move, but not how its normals and texture coordinates change.
+    Mitsuba 3.9 knows how the points of an instance move, but not how its normals and texture coordinates change. And of
+    an instance that moves, it does not know either what the motion of the ray does to them.
     """
     si = pi.compute_surface_interaction(ray, flags, active)
     for shape in scene.shapes():
-        if shape.class_name() == "Instance" and dr.grad_enabled(matrix_of(shape)):
+        if shape.class_name() == "Instance" and _moves(shape) and dr.grad_enabled(matrix_of(shape), ray.o, ray.d):
             on_shape = active & si.is_valid() & (pi.instance == mi.ShapePtr(shape))
             _attach(si, mi.AffineTransform4f(matrix_of(shape, on_shape)), ray, pi, flags, on_shape)
     return si
+
+
+def _moves(instance: mi.Shape) -> bool:
+    """Does `to_world` carry a gradient, wherever gradients may be suspended?"""
+    with dr.resume_grad():
+        return dr.grad_enabled(matrix_of(instance))
 
 
 def _attach(si, to_world: mi.AffineTransform4f, ray, pi, flags, active) -> None:

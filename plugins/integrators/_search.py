@@ -193,13 +193,12 @@ class BoundarySearch:
     # ---------------------- Boundaries ----------------------
 
     def _refuse_instances(self, moving: Moving) -> None:
-        """Refuse instances that move, and on which the jumps are not known that lie inside of faces."""
-        instances = [s for s in moving.shapes if inner(s) is not s]
-        jumps = names(s for s in instances if is_mirror(s) or len(TextureLines([inner(s)])))
-        if jumps:
+        """Refuse instances that move, and are perfect mirrors or glass: how what they show slides is not known."""
+        mirrors = names(s for s in moving.shapes if inner(s) is not s and is_mirror(s))
+        if mirrors:
             raise Refusal(
-                f"{self.who}: instances {', '.join(jumps)} move, and are mirrors or glass, or their textures or bump "
-                "maps jump: where the jumps go is not known. Replace them by meshes."
+                f"{self.who}: instances {', '.join(mirrors)} move, and are mirrors or glass: where the jumps in what "
+                "they show go is not known. Replace them by meshes."
             )
 
     def _find(self, scene: mi.Scene, moving: Moving, sppi: int) -> Boundaries:

@@ -153,7 +153,7 @@ class BisectionTerm(Term):
             of_plane = (dr.dot(dr.detach(moving.n), way.d) for way in (at.along, at.across))
             along, across = (dr.select(at.grazes, new, old) for new, old in zip(of_plane, (along, across), strict=True))
         if textures is not None:
-            line, *of_line = _at_line(textures, at)
+            line, *of_line = _at_line(job.tracer.scene, textures, at)
             along, across = (
                 dr.select(at.on_texture, new, old) for new, old in zip(of_line, (along, across), strict=True)
             )
@@ -206,7 +206,7 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
         aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
         aside = dr.select(~at.on_texture & ~at.grazes, aside, 0)
     if chains.textures is not None:
-        line, along, _ = _at_line(chains.textures, at)
+        line, along, _ = _at_line(chains.tracer.scene, chains.textures, at)
         si = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, at.found & at.on_texture)
         texels = dr.maximum(BESIDE_TEXTURE * chains.textures.rounding(line, si), chains.textures.step(line))
         aside = dr.select(at.on_texture, texels / dr.abs(along), aside)
@@ -232,13 +232,13 @@ def _goes_on(vertex: Vertex) -> mi.Bool:
     return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
 
 
-def _at_line(textures: TextureLines, at: Parting) -> tuple[Line, mi.Float, mi.Float]:
+def _at_line(scene: mi.Scene, textures: TextureLines, at: Parting) -> tuple[Line, mi.Float, mi.Float]:
     """The line on a surface that the rays meet, and the derivatives of g along and across the segment."""
     active = at.found & at.on_texture
     here, there = (v.pi.compute_surface_interaction(v.ray, mi.RayFlags.All, active) for v in (at.a, at.b))
     line = textures.between(here, there)
     g = partial(textures.across, line)
-    return line, *(change_of(g, at.a.ray, at.a.pi, way, active) for way in (at.along, at.across))
+    return line, *(change_of(scene, g, at.a.ray, at.a.pi, way, active) for way in (at.along, at.across))
 
 
 def find_segment(chains: Chains, film: mi.Film, sampler: mi.Sampler) -> Segment:

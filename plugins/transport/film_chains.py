@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.meshes import surfaces
 from rimlight.edge_sampling.geometry.surfaces import components
 from rimlight.edge_sampling.rays import lift, spawn_ray
@@ -70,6 +71,7 @@ def normal_derivative(si: mi.SurfaceInteraction3f, moved: mi.Vector3f) -> mi.Vec
 
 
 def change_of(
+    scene: mi.Scene,
     function: Callable[[mi.SurfaceInteraction3f], mi.Float],
     ray: mi.Ray3f,
     pi: mi.PreliminaryIntersection3f,
@@ -83,7 +85,7 @@ def change_of(
     with dr.resume_grad(τ):
         moved = mi.Ray3f(ray)
         moved.o, moved.d = ray.o + τ * way.o, ray.d + τ * way.d
-        value = function(pi.compute_surface_interaction(moved, mi.RayFlags.All, active))
+        value = function(surface_met(scene, moved, pi, mi.RayFlags.All, active))
         dr.set_grad(τ, 1)
         dr.enqueue(dr.ADMode.Forward, τ)
         dr.traverse(dr.ADMode.Forward)

@@ -53,13 +53,16 @@ def cones(tree: EdgeTree) -> np.ndarray:
     p, q, a, b = (np.array(packet, float).reshape(-1, 4)[:, :3] for packet in tree.slots)
     normals = np.stack([p, q], 1) * (a != b).any(1)[:, None, None]  # zero in slots without an edge
     found = np.zeros((tree.node_offsets[-1], 4), np.float32)
-    for depth, first, leaf in zip(tree.depths, tree.node_offsets, tree.leaf_offsets, strict=False):
-        for level in range(depth + 1):
-            n = normals[leaf * LEAF :][: 2**depth * LEAF].reshape(2**level, -1, 3)
-            axis = n.sum(1)
-            axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
-            cosine = np.where(n.any(2), np.einsum("ijk,ik->ij", n, axis), 1).min(1)
-            found[first + 2**level :][: 2**level] = np.c_[axis, np.arccos(np.clip(cosine, -1, 1))]
+    for leaves, first, leaf in zip(tree.leaves, tree.node_offsets, tree.leaf_offsets, strict=False):
+        below = dict(enumerate(normals[leaf * LEAF :][: leaves * LEAF].reshape(leaves, -1, 3), start=leaves))
+        for node in reversed(range(1, 2 * leaves)):
+            if node < leaves:
+                below[node] = np.concatenate([below.pop(2 * node), below.pop(2 * node + 1)])
+            n = below[node]
+            axis = n.sum(0)
+            axis /= max(np.linalg.norm(axis), 1e-9)
+            cosine = np.where(n.any(1), n @ axis, 1).min()
+            found[first + node] = *axis, np.arccos(np.clip(cosine, -1, 1))
     return found
 
 

@@ -91,7 +91,7 @@ def unit(*v: float) -> np.ndarray:
 # ---------------------- Contents ----------------------
 
 
-@pytest.mark.parametrize("points", [4, 5, 6, 47, 300])
+@pytest.mark.parametrize("points", [4, 5, 6, 12, 15, 47, 300])
 @pytest.mark.parametrize("groups", [None, odd_and_even], ids=["one group", "two groups"])
 def test_every_edge_is_in_exactly_one_slot(points, groups):
     setup = tree_over(bumpy_sphere(points), **({"groups": groups} if groups else {}))
@@ -186,13 +186,25 @@ def test_refit_does_the_same_whether_it_is_recorded_replayed_or_traced():
     for k in range(4):
         q = p * dr.opaque(mi.Float, 1 + 0.3 * k)
         recorded.refit(q)
-        traced._refit(q)
+        traced.nodes, traced.slots = traced._fitted(q)
         # In turn, by its own recording and by theirs.
         frozen.refit(q) if k % 2 else in_users_function(frozen, q)
         for which in ("nodes", "slots"):
             expected = setups[1].numbers(which)
             assert all((setup.numbers(which) == expected).all() for setup in setups)
     assert in_users_function.n_recordings == 1
+
+
+def test_refit_needs_little_memory_besides_the_tree():
+    """No copy of it for each level."""
+    setup = tree_over(bumpy_sphere(8000))
+    for _ in range(3):
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        setup.tree.refit(moved(setup))
+        dr.sync_thread()
+    assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) < 4 * setup.tree.bytes
 
 
 def test_refit_root_equals_that_of_a_tree_built_there():
@@ -255,7 +267,7 @@ def draw(
         axis, angle = cone
         cone = Cone(vector(axis), number(np.cos(angle)), number(np.sin(angle)))
     view = View(p, vector(n), number(wide), lobes, cone)
-    use = use or [True] * len(setup.tree.depths)
+    use = use or [True] * len(setup.tree.leaves)
     choice = sampler.next_1d()
 
     def sample(k, sampler):

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from meshes import bumpy_sphere
-from random_scenes import torus
+from random_scenes import ball, torus
 
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import Geometry, ShadingBoundary, Silhouettes, find_edges
@@ -423,3 +423,36 @@ def test_back_of_a_face_beside_the_front_of_another(angle, divided):
     # The bright face is a triangle of width 1: its area grows by its own size for each unit.
     error = np.std(found, ddof=1) / np.sqrt(len(found))
     assert abs(np.mean(found) - seen) < 4 * error + 0.01 * seen and error < 0.02 * seen
+
+
+@pytest.mark.parametrize("thickness", [0.1, 0.01, 0.001])
+def test_sharp_edges_of_one_sided_surfaces(thickness):
+    """Close to them, rays meet both faces at the same distance, up to rounding: they must not see the one that faces
+    away, and is black."""
+    vertices = cases.cube_vertices() @ np.diag([1, 1, thickness]) + [0, 0.6, 0]
+    images = []
+    for two_sided in (False, True):
+        slab = cases.mesh("thing", vertices, cases.CUBE_FACES, bsdf=cases.diffuse(0.7, two_sided=two_sided))
+        scene = cases.scene(sensor=camera((0.4, 1, -5)), thing=slab, sky={"type": "constant"})
+        motion = Motion(scene, "thing.vertex_positions", direction=[1, 0.2, 0.4])
+        made = mi.load_dict({"type": "direct_edge"})
+        images.append(np.array(derivative_image(scene, made, motion, spp=64, seed=0), float))
+    assert np.abs(images[0] - images[1]).sum() < 0.02 * np.abs(images[1]).sum()
+
+
+def test_opacity_that_jumps_along_edges_of_a_smooth_ball():
+    """Where nothing shines behind, a hole is black paint, which counts once."""
+    vertices, _, uv, faces = ball(8)
+    squares = np.indices((4, 4)).sum(0)[..., None] % 2
+    texels = {"type": "bitmap", "bitmap": mi.Bitmap(np.float32(squares)), "raw": True, "filter_type": "nearest"}
+    paint = {"type": "diffuse", "reflectance": texels}
+    mask = {"type": "mask", "opacity": texels, "nested": {"type": "diffuse", "reflectance": 1.0}}
+    images = []
+    for bsdf in (mask, paint):
+        thing = cases.mesh("thing", 0.8 * vertices, faces, True, uv, bsdf=bsdf)
+        lamp = cases.horizontal((0.6, 3, -0.8), 0.6, "lamp", down=True, emitter=cases.light(10, 10, 9))
+        scene = cases.scene(sensor=camera((0.4, 1, -5), (0, 0, 0)), thing=thing, lamp=lamp)
+        motion = Motion(scene, "thing.vertex_positions", direction=[1, 0.2, 0.4])
+        made = mi.load_dict({"type": "direct_edge"})
+        images.append(np.array(derivative_image(scene, made, motion, spp=256, seed=0), float))
+    assert np.abs(images[0] - images[1]).sum() < 0.01 * np.abs(images[1]).sum()
