@@ -11,7 +11,8 @@ import mitsuba as mi
 def spreads(bsdf: mi.BSDF | mi.BSDFPtr) -> mi.Bool | bool:
     """Does it reflect light from all directions, and let none through, unless as if nothing was there? Only then may
     light be sampled in a lune."""
-    return (bsdf.flags() & (mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission) & ~mi.BSDFFlags.Null) == 0
+    others = (mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission) & ~int(mi.BSDFFlags.Null)
+    return (bsdf.flags() & others) == 0
 
 
 @dataclass(frozen=True)
