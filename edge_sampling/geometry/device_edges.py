@@ -25,8 +25,9 @@ BEHIND = 8
 #: And beside those of meshes that rays go through as if nothing was there, in units of the offset of such rays.
 BESIDE_MASK = 2
 
-#: And beside lines in which shapes cut through each other, in the same units, where the other surface overhangs: the
-#: cotangent of the angle between both, beyond which rays start below it, but at most the second number.
+#: And beside lines in which shapes cut through each other, and edges of acute corners, in the same units, where the other
+#: surface overhangs: the cotangent of the angle between both, beyond which rays start below it, but at most the second
+#: number.
 BESIDE_LINE = 1.25, 8
 
 #: And beside sharp edges, in units of `beside_edge`, times the cotangent of the angle between the faces, but at most so
@@ -125,6 +126,10 @@ class DeviceEdges:
         """
         a, b = self.end_points(positions, edge)
         return [dr.cross(b - a, o - a) for o in self.opposite(positions, edge)]
+
+    def _along(self, positions: mi.Float, edge: mi.UInt32) -> mi.Vector3f:
+        a, b = self.end_points(positions, edge)
+        return b - a
 
     def opposite(self, positions: mi.Float, edge: mi.UInt32) -> list[mi.Point3f]:
         """The third vertex of the face on each side, world space."""
@@ -237,11 +242,13 @@ class DeviceEdges:
         """How much farther beside a point p of edges to look than rounding asks for: scene units. Detached.
 
         Rays start that far below the first face of glass, and so above the second, if they are closer to the edge than
-        this times the cotangent of the angle between both.
+        this times the cotangent of the angle between both. In a corner of less than 90° that is seen from inside, rays
+        that leave one face start beyond the other.
         """
         of = lambda kind: dr.gather(mi.Bool, kind, edge)
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         cotangent = dr.dot(first, second) / dr.norm(dr.cross(first, second))
+        inside = dr.dot(dr.cross(first + second, self._along(positions, edge)), to_viewer) > 0
         wedge = dr.select(of(self._glass) & of(self._two_faces), dr.clip(cotangent, 0, 1), 0)
         if self._any_lines:
             wedge = dr.select(of(self._is_line), self._overhang(positions, edge, p, to_viewer), BEHIND * wedge)
@@ -251,6 +258,10 @@ class DeviceEdges:
         margin, most = BESIDE_SHARP
         sharp = dr.select(of(self._two_faces), dr.clip(cotangent, 0, most), 0)
         farther += dr.select(sharp > 0, margin * sharp * beside_edge(p, p + to_viewer), 0)
+        # Where several faces meet, some of them may be as close as that to each other.
+        margin, most = BESIDE_LINE
+        corner = dr.select(of(self._few_faces), dr.select(inside & (sharp > 0), dr.minimum(sharp, most), 0), most)
+        farther += dr.select(of(self._is_line), 0, margin * corner * lift(scene, p))
         return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
 
     def _overhang(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:

@@ -400,6 +400,32 @@ def test_fold_beside_a_contour_counts_once(kind, gap):
     assert image[..., 0].sum() == pytest.approx(-area * pixels_per_unit**2, rel=0.01)
 
 
+# ---------------------- Acute corners ----------------------
+
+
+@pytest.mark.parametrize("faces", [2, 5])
+def test_acute_corner_seen_from_inside(faces):
+    """Two boards at 72°, one of which throws its shadow on the other, down to their common edge; or five in a star. So
+    close to the edge, rays that leave one face start beyond the other."""
+    angle = 0.3 + 2 * np.pi / 5 * np.arange(5)
+    corners = np.concatenate([[[0, 0, -1], [0, 0, 1]], np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)])
+    turned = corners @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0].T
+    star = [[0, 1, 6], [1, 0, 2]] if faces == 2 else [[0, 1, 2 + k] for k in range(5)]
+    board = cases.mesh("board", turned, star, bsdf=cases.diffuse(0.7, two_sided=True))
+    lamp = {"type": "point", "position": [3, 1.3, 1], "intensity": 30.0}
+    sensor = camera((0.37, 0.23, 4), (0.03, 0, 0))
+    scene = cases.scene(sensor=sensor, board=board, lamp=lamp)
+    integrator, path = mi.load_dict({"type": "direct_edge"}), mi.load_dict({"type": "path", "max_depth": 2})
+    motion, step = Motion(scene, "board.vertex_positions", direction=(1, 0.3, 0)), 0.02
+    ours = np.mean([np.array(derivative_image(scene, integrator, motion, spp=512, seed=i)) for i in range(4)], 0)
+    images = []
+    for θ in (step, -step):
+        motion.apply(mi.Float(θ))
+        images.append(np.mean([np.array(mi.render(scene, integrator=path, spp=2048, seed=i)) for i in range(4)], 0))
+    expected = (images[0] - images[1]) / (2 * step)
+    assert np.abs(ours - expected).sum() < 0.12 * np.abs(expected).sum()
+
+
 # ---------------------- Faces that look to different sides ----------------------
 
 
