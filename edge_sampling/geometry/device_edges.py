@@ -25,9 +25,9 @@ BEHIND = 8
 #: And beside those of meshes that rays go through as if nothing was there, in units of the offset of such rays.
 BESIDE_MASK = 2
 
-#: And beside lines in which shapes cut through each other, and edges of acute corners, in the same units, where the other
-#: surface overhangs: the cotangent of the angle between both, beyond which rays start below it, but at most the second
-#: number.
+#: And beside lines in which shapes cut through each other, and inner edges of acute corners, in the same units, where
+#: the other surface overhangs: the cotangent of the angle between both, beyond which rays start below it, but at most
+#: the second number.
 BESIDE_LINE = 1.25, 8
 
 #: And beside sharp edges, in units of `beside_edge`, times the cotangent of the angle between the faces, but at most so
