@@ -217,7 +217,7 @@ class Problem:
     """End the fit after this many seconds. Default: no limit."""
     balance: bool = False
     """After the first step of each stage, measure how noisy each part of the derivative is, and divide the samples
-    among them so that a given time leaves the least error. Takes about as long as ten to twenty steps."""
+    among them so that a given time leaves the least error. Takes as long as 20 to 40 steps."""
     max_bad: int = 20
     """End the fit after this many gradients in a row that are not finite. Each is skipped and counted."""
     freeze: bool = True

@@ -17,7 +17,7 @@ import numpy as np
 from random_scenes import Generator
 
 #: Last words of the names of parameters that stay: of films and clipping, and such as belong to others that change.
-STAYS = ("near_clip", "far_clip", "vertex_normals", "vertex_texcoords", "faces", "bbox", "film", "srf", "size", "shape")
+STAYS = ("near_clip", "far_clip", "faces", "bbox", "film", "srf", "size", "shape")
 
 METALS = ("Au", "Cu", "Al", "Cr", "W")
 
@@ -157,6 +157,8 @@ class ParameterGenerator(Generator):
             return False
         if key.startswith("copy") or key.startswith("group"):
             return False  # what moves must not show instances
+        if dr.is_array_v(value) and dr.width(value) == 0:
+            return False  # normals that a mesh does not have, say
         return (dr.is_diff_v(value) and dr.is_float_v(dr.leaf_t(value))) or dr.is_matrix_v(value) or is_frame(value)
 
     def change(self, params: mi.SceneParameters, key: str) -> Callable[[mi.Float], None]:

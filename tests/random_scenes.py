@@ -58,6 +58,7 @@ SPECIAL = {
     "instances": "there are two or three instances of meshes besides, which mostly are what moves",
     "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
     "parameters": "their materials have all kinds of values, and any parameters change (`random_parameters.py`)",
+    "meshes": "things are torn, turned round, cut through themselves, or one of many faces (`random_meshes.py`)",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
@@ -638,15 +639,16 @@ class Generator:
 
 
 def make(seed: int, sampler: str = "independent", home: bool = False, special: str = "") -> RandomScene:
+    # Which are built on this file
     if special == "rooms":
-        from random_rooms import RoomGenerator  # which is built on this file
-
-        return RoomGenerator(seed, sampler, home, special).make()
-    if special == "parameters":
-        from random_parameters import ParameterGenerator
-
-        return ParameterGenerator(seed, sampler, home, special).make()
-    return Generator(seed, sampler, home, special).make()
+        from random_rooms import RoomGenerator as Kind
+    elif special == "parameters":
+        from random_parameters import ParameterGenerator as Kind
+    elif special == "meshes":
+        from random_meshes import MeshGenerator as Kind
+    else:
+        Kind = Generator
+    return Kind(seed, sampler, home, special).make()
 
 
 # ---------------------- Comparison ----------------------
