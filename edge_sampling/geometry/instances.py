@@ -13,6 +13,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .meshes import (
     Geometry,
@@ -29,6 +30,9 @@ from .meshes import (
     tells_shapes_in_groups,
     texcoords_of,
 )
+
+#: An instance is flat if its smallest stretch is below this, relative to its largest.
+FLAT = 1e-5
 
 
 class MeshOfInstance:
@@ -163,6 +167,13 @@ def matrix_of(instance: mi.Shape, active: mi.Bool | bool = True) -> mi.Matrix4f:
     # Each sample reads for itself: in a loop, Dr.Jit cannot add up the gradients of samples.
     row = lambda i: [dr.gather(mi.Float, numbers, mi.UInt32(4 * i + j), active) for j in range(4)]
     return mi.Matrix4f(*row(0), *row(1), *row(2), 0, 0, 0, 1)
+
+
+def is_flat(instance: mi.Shape) -> bool:
+    """Has the transformation of an instance no inverse, up to rounding?"""
+    matrix = np.array(dr.detach(matrix_of(instance)), float).reshape(4, 4)
+    stretches = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    return bool(stretches[2] <= FLAT * stretches[0])
 
 
 def surface_met(

@@ -18,7 +18,17 @@ import numpy as np
 
 from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
 from .mapped_horizons import mapped_horizons
-from .meshes import Geometry, has_place, has_texcoords, is_map, is_met, objects_below, pointer, texture_coordinates
+from .meshes import (
+    Geometry,
+    has_place,
+    has_texcoords,
+    inner,
+    is_map,
+    is_met,
+    objects_below,
+    pointer,
+    texture_coordinates,
+)
 
 #: The texture that shows a volume on a surface.
 VOLUME = "VolumeAdapter"
@@ -215,7 +225,7 @@ def maps_in_steps(shapes: Sequence[Any]) -> list[str]:
     """Names of the bitmaps of normals and heights which a GPU interpolates in steps."""
     found = {}
     for shape in shapes:
-        below = objects_below(shape)
+        below = objects_below(inner(shape))
         for name, o in below.items():
             if isinstance(o, mi.BSDF) and is_map(o):
                 child = f"{name}.{'nested_texture' if o.class_name() == 'BumpMap' else 'normalmap'}"

@@ -34,7 +34,7 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.choice.light_choice import LightChoice
-from rimlight.edge_sampling.geometry.instances import Instances
+from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
 from rimlight.edge_sampling.geometry.meshes import inner, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
@@ -193,12 +193,19 @@ class BoundarySearch:
     # ---------------------- Boundaries ----------------------
 
     def _refuse_instances(self, moving: Moving) -> None:
-        """Refuse instances that move, and are perfect mirrors or glass: how what they show slides is not known."""
+        """Refuse instances that move, and are perfect mirrors or glass: how what they show slides is not known; and
+        those that are flat, on which Mitsuba does not know what a ray meets."""
         mirrors = names(s for s in moving.shapes if inner(s) is not s and is_mirror(s))
         if mirrors:
             raise Refusal(
                 f"{self.who}: instances {', '.join(mirrors)} move, and are mirrors or glass: where the jumps in what "
                 "they show go is not known. Replace them by meshes."
+            )
+        flat = names(s for s in moving.shapes if inner(s) is not s and is_flat(s.instance))
+        if flat:
+            raise Refusal(
+                f'{self.who}: instances {", ".join(flat)} move, and are flat: their "to_world" has no inverse. Give '
+                "them a thickness."
             )
 
     def _find(self, scene: mi.Scene, moving: Moving, sppi: int) -> Boundaries:

@@ -115,6 +115,22 @@ def test_mirrors_that_move_are_refused(bsdf):
         forward(scene, mi.load_dict(INTEGRATORS["direct_edge"]), 1, key="thing.to_world", direction=[1, 0, 0])
 
 
+@pytest.mark.parametrize("thickness", [0, 1e-6, 1e-3])
+def test_flat_instances_that_move_are_refused(thickness):
+    place = mi.ScalarTransform4f().rotate([0, 1, 0.3], 40).scale([1, 1, thickness])
+    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": building.diffuse(0.5)}}
+    thing = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": place}
+    scene = building.scene(sensor=building.camera(), group=group, thing=thing, **instances.room())
+    render = lambda: forward(
+        scene, mi.load_dict(INTEGRATORS["direct_edge"]), 1, key="thing.to_world", direction=[1, 0, 0]
+    )
+    if thickness > 1e-4:
+        assert np.abs(np.array(render())).sum() > 0
+    else:
+        with pytest.raises(RuntimeError, match='instances "thing" move, and are flat: their "to_world" has no inverse'):
+            render()
+
+
 # ---------------------- On GPUs ----------------------
 
 
