@@ -45,6 +45,7 @@ RICH = Problem(
     seed=11,
     patience=9,
     seconds=1.5,
+    balance=True,
     max_bad=2,
     freeze=False,
     variant="cuda_ad_rgb",
