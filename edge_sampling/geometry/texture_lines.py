@@ -240,7 +240,9 @@ def _in_steps(texture: mi.Texture) -> bool:
     if not texture.class_name().startswith("Bitmap"):
         return False
     size = np.array(texture.resolution(), float)
-    corners = np.random.default_rng(0).uniform(0, np.minimum(size, FIRST_TEXELS), (TEXELS, 2))
+    # Well inside of texels, where `nearest` bitmaps do not change at all
+    random = np.random.default_rng(0)
+    corners = random.integers(0, np.minimum(size, FIRST_TEXELS), (TEXELS, 2)) + random.uniform(0.1, 0.9, (TEXELS, 2))
     apart = TEXTURE_UNIT_STEP / PLACES_OF_STEP * np.arange(2 * PLACES_OF_STEP + 1)
     places = (corners[:, None] + apart[:, None]) / size
     to_uv = np.array(mi.traverse(texture)["to_uv"].matrix, float)

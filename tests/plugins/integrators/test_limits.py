@@ -93,12 +93,13 @@ def test_maps_that_are_interpolated_in_steps(monkeypatch, kind, name, steps):
     assert sum(said_so) == steps
 
 
-def test_bitmaps_of_any_size_and_format_are_interpolated_without_steps():
+@pytest.mark.parametrize("filter_type", ["nearest", "bilinear"])
+def test_bitmaps_of_any_size_and_format_are_interpolated_without_steps(filter_type):
     random = np.random.default_rng(0)
     for size in (1, 2, 300, 3000):
         texels = random.random((size, size, 3))
         for values in (texels.astype(np.float32), texels.astype(np.float16), (255 * texels).astype(np.uint8)):
-            made = {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "format": "auto"}
+            made = {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "filter_type": filter_type}
             place = mi.ScalarTransform3f().scale([2, 3]).rotate(20)
             assert not texture_lines._in_steps(mi.load_dict({**made, "to_uv": place}))
 

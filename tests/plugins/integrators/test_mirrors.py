@@ -78,5 +78,5 @@ def test_slopes_jump_for_texture_units_of_gpus_as_well(monkeypatch):
         monkeypatch.setattr(name, lambda _, answer=in_steps: answer)
         found.append(np.array(derivative_image(scene, made, motion, spp=64, seed=1), float))
     exact, coarse = found
-    assert (exact != coarse).any()
-    assert np.abs(exact - coarse).sum() < 0.01 * np.abs(exact).sum()
+    # More than what sums of several threads differ by, 2e-8
+    assert 1e-4 < np.abs(exact - coarse).sum() / np.abs(exact).sum() < 0.01
