@@ -26,6 +26,9 @@ LEAST = 64 / 1500
 #: the size of the scene, in RayEpsilon: 16 units in the last place. And least cosine by which that is divided.
 THROUGH, STEEPEST = 16 / 1500, 0.01
 
+#: A ray that meets something within this part of the offset of rays starts in the face that it meets.
+AT_START = 0.5
+
 
 def spawn_ray(
     scene: mi.Scene, si: mi.SurfaceInteraction3f, d: mi.Vector3f, through: mi.Bool | bool = False
@@ -80,6 +83,12 @@ def lift(scene: mi.Scene, p: mi.Point3f) -> mi.Float:
     if size is not None:
         usual = dr.maximum(dr.minimum(usual, PART * size), LEAST * reach)
     return usual * mi.math.RayEpsilon
+
+
+def starts_in(scene: mi.Scene, ray: mi.Ray3f, t: mi.Float) -> mi.Bool:
+    """Does a ray start in what it meets at the distance t? So it does close to the edge of an acute corner, where it
+    starts about as far above one face as the other one is."""
+    return t < AT_START * lift(scene, ray.o)
 
 
 def lift_beyond(scene: mi.Scene, p: mi.Point3f) -> mi.Float:

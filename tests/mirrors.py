@@ -111,6 +111,42 @@ def mirrored_cut_sphere() -> mi.Scene:
     return mirrored_cut({"type": "sphere", "center": [0.1, 0.45, 0], "radius": 0.5, "bsdf": diffuse(0.8, 0.5, 0.3)})
 
 
+# ---------------------- Hard shadows that mirrors and glass show ----------------------
+
+
+def point_light() -> dict:
+    return {"type": "point", "position": [1.5, 3, -1], "intensity": {"type": "rgb", "value": 20.0}}
+
+
+def shadow_in_wall(thing: dict | None = None, **lights: Any) -> mi.Scene:
+    """A cube, or another thing, over a floor, and a wall that mirrors the shadow. The camera sees the wall alone."""
+    floor = horizontal((0, 0, 0), 3, "floor", bsdf=diffuse(0.6, two_sided=True))
+    wall = quad((-1.6, -0.4, 2.2), (0, 3.2, 0), (3.2, 0, 0), "mirror", bsdf={"type": "conductor"})
+    at = camera((0.2, 2.2, -0.5), (0, 0.9, 2.2), fov=60)
+    things = {"cube": cube((0.1, 0.8, 0))} if thing is None else {"ball": thing}
+    return scene(sensor=at, **things, floor=floor, mirror=wall, **(lights or {"point": point_light()}))
+
+
+def shadows_of_ball() -> mi.Scene:
+    """A sphere, in the light of a point and in that of the sun."""
+    ball = {"type": "sphere", "center": [0.1, 0.8, 0], "radius": 0.4, "bsdf": diffuse(0.5)}
+    sun = {"type": "directional", "direction": [-0.5, -1, 0.4], "irradiance": {"type": "rgb", "value": 2.0}}
+    return shadow_in_wall(ball, point=point_light(), sun=sun)
+
+
+def corners_behind_pane() -> mi.Scene:
+    """Five boards with one edge, which throw shadows on each other, behind a pane. So close to their edge, rays that
+    leave one of them start beyond the next."""
+    angle = 0.3 + 2 * np.pi / 5 * np.arange(5)
+    corners = np.concatenate([[[0, 0, -1], [0, 0, 1]], np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)])
+    turned = corners @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0].T
+    faces = [[0, 1, 2 + k] for k in range(5)]
+    star = mesh("ball", turned, faces, bsdf=diffuse(0.7, two_sided=True))
+    pane = quad((-3, -3, 2), (6, 0, 0), (0, 6, 0), "pane", bsdf={"type": "thindielectric"})
+    lamp = {"type": "point", "position": [3, 1.3, 1], "intensity": {"type": "rgb", "value": 30.0}}
+    return scene(sensor=camera((0.37, 0.23, 4), (0.03, 0, 0)), ball=star, pane=pane, lamp=lamp)
+
+
 # ---------------------- Textures that jump ----------------------
 
 
@@ -259,6 +295,11 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "glass_ball_camera": (glass_ball, CAMERA, 1e-3, 6),
     "mirrored_ball": (mirrored_ball, BALL, 2e-3, 3),
     "smooth_mirror": (smooth_mirror, MESH, 2e-3, 3),
+    "shadow_in_mirror": (shadow_in_wall, SLIDE, 4e-3, 3),
+    "shadow_in_mirror_turns": (shadow_in_wall, MIRROR, 2e-3, 3),
+    "shadow_in_mirror_light": (shadow_in_wall, {"key": "point.position", "direction": [1, 0.3, 0.2]}, 4e-3, 3),
+    "shadows_of_ball": (shadows_of_ball, CAMERA, 4e-3, 3),
+    "corners_behind_pane": (corners_behind_pane, {**MESH, "direction": [1, 0.3, 0]}, 4e-3, 3),
     "checkerboard": (checkerboard, BOARD, 2e-3, 2),
     "checkerboard_camera": (checkerboard, CAMERA, 2e-3, 3),
     "checkerboard_close": (close_up, CAMERA, 1e-3, 2),

@@ -58,10 +58,14 @@ SPECIAL = {
     "instances": "there are two or three instances of meshes besides, which mostly are what moves",
     "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
     "parameters": "their materials have all kinds of values, and any parameters change (`random_parameters.py`)",
+    "mirrors": "perfect mirrors and glass show what points, spots and suns light (`random_mirrors.py`)",
     "meshes": "things are torn, turned round, cut through themselves, or one of many faces (`random_meshes.py`)",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
+
+#: Kinds of lights; those without size are in the middle.
+LIGHTS = ("area", "ball", "disklight", "meshball", "point", "spot", "sun", "sky", "environment")
 
 #: A projection whose standard error is above this tells nothing: more samples are taken.
 TELLING = 0.03
@@ -188,12 +192,12 @@ class Generator:
         if self.home:
             self.scale, self.origin = 1.0, np.zeros(3)
         # What moves must not show instances, whose outlines were unknown: no sky, no gloss, no interreflections.
-        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams", "instances")
+        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams", "instances", "mirrors")
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
-        direct = {"jumps": not self.glows, "beams": False}.get(self.special, direct)
-        self.depth = depth = 2 if direct else int(self.rng.integers(2, 6))
+        direct = {"jumps": not self.glows, "beams": False, "mirrors": False}.get(self.special, direct)
+        self.depth = depth = 2 if direct else self.longest()
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
 
@@ -214,6 +218,10 @@ class Generator:
         scene = mi.load_dict(self.objects)
         params, move = self.make_motion(scene, cameras=not self.instances)
         return RandomScene(scene, params, move, integrator, depth, " ".join(self.labels))
+
+    def longest(self) -> int:
+        """`max_depth` of paths with interreflections."""
+        return int(self.rng.integers(2, 6))
 
     # ---------------------- Placing ----------------------
 
@@ -499,10 +507,7 @@ class Generator:
 
     def make_light(self, i: int, before: list[str]) -> str:
         name = f"light{i}"
-        kinds = ("area", "ball", "disklight", "meshball", "point", "spot", "sun", "sky", "environment")
-        if self.special == "beams":
-            kinds = ("spot", "projector")
-        kind = self.pick(*kinds)
+        kind = self.pick(*{"beams": ("spot", "projector"), "mirrors": LIGHTS[4:7]}.get(self.special, LIGHTS))
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
         centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])
@@ -644,6 +649,8 @@ def make(seed: int, sampler: str = "independent", home: bool = False, special: s
         from random_rooms import RoomGenerator as Kind
     elif special == "parameters":
         from random_parameters import ParameterGenerator as Kind
+    elif special == "mirrors":
+        from random_mirrors import MirrorGenerator as Kind
     elif special == "meshes":
         from random_meshes import MeshGenerator as Kind
     else:

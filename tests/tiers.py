@@ -204,7 +204,7 @@ test_light_choice.py::test_frozen_functions
 test_light_choice.py::test_gradients_are_those_of_forward_mode
 test_light_choice.py::test_same_derivative_with_less_noise[integrator1]
 test_merl.py::test_table_in_a_render[direct_edge]
-test_mirrors.py::test_frozen_functions[prb_edge]
+test_mirrors.py::test_frozen_functions[over_mirror-prb_edge]
 test_mirrors.py::test_frozen_functions_with_normal_maps
 test_mirrors.py::test_gradients_are_those_of_forward_mode[bumpy_ball
 test_mirrors.py::test_gradients_are_those_of_forward_mode[glass_ball-ball.to_world-prb_edge]

@@ -16,17 +16,18 @@ from .fine_mirrors import FineMirrors
 from .indirect_shadows import IndirectShadows
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary
+from .shown_shadows import ShownShadows
 
 
 @dataclass(frozen=True)
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
-    does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see
-    `Vicinity`. `mirrors` : may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` :
-    those whose fringe is not looked at closely. `textures` : where those jump that the camera may see move, and mapped
-    normals turn away. `surfaces` : what chains meet, where there are mirrors or textures. `lights` : chooses one, where
-    there are many. `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from
-    surfaces."""
+    does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see `Vicinity`. `mirrors` :
+    may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` : those whose fringe is not looked
+    at closely. `textures` : where those jump that the camera may see move, and mapped normals turn away. `shown` :
+    shadows that mirrors or glass may show. `surfaces` : what chains meet, where there are mirrors or textures.
+    `lights` : chooses one, where there are many. `indirect` : shadows, and borders of beams, in indirect light.
+    `deep` : shadows in light from surfaces."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -41,6 +42,7 @@ class Boundaries:
     mirrors: bool = False
     fine_mirrors: FineMirrors | None = None
     textures: TextureLines | None = None
+    shown: ShownShadows | None = None
     surfaces: Surfaces | None = None
     lights: LightChoice | None = None
     deep: DeepShadows | None = None

@@ -272,10 +272,7 @@ class DeviceEdges:
             here, line = self._number(edge, start, lines.capacity)
             normals = [dr.select(here, m, n) for m, n in zip(lines.normals(positions, line, p), normals, strict=True)]
             start += lines.capacity
-        first, second = (dr.mulsign(n, dr.dot(n, to_viewer)) for n in normals)
-        cotangent = -dr.dot(first, second) / dr.norm(dr.cross(first, second))
-        margin, most = BESIDE_LINE
-        return dr.clip(margin * cotangent, 0, most)
+        return overhang(*(dr.mulsign(n, dr.dot(n, to_viewer)) for n in normals))
 
     def is_smooth(self, edge: mi.UInt32) -> mi.Bool:
         """Are interpolated normals, and all else, the same on both sides?"""
@@ -356,6 +353,14 @@ class DeviceEdges:
         if geometry is not None and EdgeKind.SPLIT in self._kinds:
             boundary |= (kind == int(EdgeKind.SPLIT)) & (self.normals_differ(geometry.normals(), edge) > COPLANAR)
         return boundary
+
+
+def overhang(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
+    """How far beside a line in which two surfaces meet rays start below the other one, in units of the offset of rays:
+    see `BESIDE_LINE`. first, second : their normals, on the side of the viewer."""
+    cotangent = -dr.dot(first, second) / dr.norm(dr.cross(first, second))
+    margin, most = BESIDE_LINE
+    return dr.clip(margin * cotangent, 0, most)
 
 
 def line_of_sight(p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]) -> mi.Vector3f:

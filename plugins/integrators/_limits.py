@@ -190,6 +190,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid). Replace "
             "them by meshes."
         )
+    turned = names(s for s in moving.known if not has_its_inverse(s))
+    if turned:
+        limits.append(
+            f'the derivative is wrong for {", ".join(turned)}: the inverse of "to_world" is not the one that Mitsuba '
+            "keeps. It takes the axis of `rotate` as it is: give it the length 1."
+        )
     moves = lambda s: s in moving.on_film
     cut = sorted({tuple(sorted((a.id(), b.id()))) for a, b in cuts_of_others(scene, geometry) if moves(a) or moves(b)})
     if cut:
@@ -210,6 +216,16 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"units wide: {pairs}. Join the vertices there, or move them farther apart."
         )
     return limits
+
+
+def has_its_inverse(shape: Any) -> bool:
+    """Is the inverse that Mitsuba keeps of the transformation of a shape that of its matrix? (The vertices of a mesh
+    are transformed already.)"""
+    if not isinstance(shape, mi.Shape) or shape.is_mesh():
+        return True
+    to_world = mi.traverse(shape)["to_world"]
+    product = np.array(to_world.matrix @ to_world.inverse().matrix, float).reshape(4, 4)
+    return bool(np.abs(product - np.eye(4)).max() < SHEARED)
 
 
 def is_mirror(shape: mi.Shape) -> bool:
@@ -324,6 +340,9 @@ def distant_scene(scene: mi.Scene) -> list[str]:
         "units away from the origin, where single precision cannot tell its points apart. Bring it close to the origin."
     ]
 
+
+#: How far a transformation times its inverse may be from the identity, without a warning.
+SHEARED = 1e-3
 
 #: Largest coordinate of a scene, relative to its diagonal, up to which there is no warning.
 DISTANT = 1000

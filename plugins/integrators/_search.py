@@ -33,6 +33,7 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
@@ -230,7 +231,9 @@ class BoundarySearch:
         mirrors = [s for s in surfaces(scene) if is_mirror(s)] if self.from_points and self.depths.scatters(1) else []
         mirrors = bool(mirrors), FineMirrors(mirrors) if mirrors else None
         textures = self._texture_lines(scene, moving, mirrors[0]) if self.from_points else None
-        chains = (*mirrors, textures, Surfaces(scene) if mirrors[0] or textures else None)
+        shown = ShownShadows(scene) if mirrors[0] and sppi and self.depths.scatters(2) else None
+        shown = shown if shown is not None and len(shown) else None
+        chains = (*mirrors, textures, shown, Surfaces(scene) if mirrors[0] or textures else None)
         lights = LightChoice.of(scene)
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights, deep)
 

@@ -16,8 +16,9 @@ import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart
+from rimlight.edge_sampling.boundaries.shown_shadows import Border
 from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
-from rimlight.edge_sampling.geometry.device_edges import BEHIND
+from rimlight.edge_sampling.geometry.device_edges import BEHIND, overhang, rounding
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
@@ -44,8 +45,8 @@ HIDDEN, HALVINGS = 4, 7
 #: Where nothing is found to jump in it after all, it is looked at once more, so many times as long.
 WIDE = 16
 
-#: How far beside lines in which surfaces cut each other to look, in units of the offset of rays that start there.
-BESIDE_CUT = 2
+#: Two surfaces meet if what both rays meet is at most so many times as far apart as the rays are, besides rounding.
+NEXT = 4
 
 #: How far beside lines of textures to look, in units in the last place of the coordinates in which they are whole.
 BESIDE_TEXTURE = 64
@@ -92,8 +93,9 @@ class BisectionTerm(Term):
             ray, again = cut(ray), cut(rays.at(segment.start)[0])
         at, moving = self._where_they_part(job, chains, segment, ray, active)
         outline = _at_outline(job.tracer.scene, at, segment) if job.boundaries.mirrors else None
-        jump, alpha = self._jump(job, _beside(chains, at, segment, outline), sampler)
-        factor, g = self._motion(job, at, segment, again, moving, outline)
+        border = _at_shadow(chains, at, segment) if chains.shown is not None else None
+        jump, alpha = self._jump(job, _beside(chains, at, segment, outline), border, sampler)
+        factor, g = self._motion(job, at, segment, again, moving, outline, border)
         dr.eval(jump, alpha, factor)
         with dr.resume_grad():
             normal_velocity = factor * (g - dr.detach(g)) * (job.weights * part.area / count)
@@ -122,14 +124,16 @@ class BisectionTerm(Term):
         return at, MovingVertex(chain, ray, first[0], log, last, behind, one, job.mode, onwards=True)
 
     @staticmethod
-    def _jump(job: Job, at: Parting, sampler: mi.Sampler) -> tuple[mi.Spectrum, mi.Float]:
+    def _jump(job: Job, at: Parting, border: Border | None, sampler: mi.Sampler) -> tuple[mi.Spectrum, mi.Float]:
         """Difference of radiance and alpha between the first chain and the second. Detached."""
         jump, alpha = mi.Spectrum(0), mi.Float(0)
         for sign, vertex, other in ((1, at.a, at.b), (-1, at.b, at.a)):
             inside = ~at.on_texture & ~at.grazes & (vertex.pi.t <= other.pi.t)
-            L, stopped = job.tracer.arriving(vertex, sampler.clone(), at.found, inside)
+            L, stopped = job.tracer.arriving(vertex, sampler.clone(), at.found & ~at.on_shadow, inside)
             jump += sign * L
             alpha += sign * dr.select(stopped & (vertex.depth == 1), mi.Float(1), 0)
+        if border is not None:
+            jump = dr.select(border.found, border.jump, jump)
         return jump * at.a.β, alpha
 
     @staticmethod
@@ -140,6 +144,7 @@ class BisectionTerm(Term):
         camera_ray: mi.Ray3f,
         moving: MovingVertex | None,
         outline: tuple[Touch, mi.Float, mi.Float] | None,
+        border: Border | None,
     ) -> tuple[mi.Float, mi.Float]:
         """The factor by which the gradient of a function g makes the part of the velocity of a jump that segments of
         this axis count, times the weight of the segment; and g, attached to the scene.
@@ -156,6 +161,15 @@ class BisectionTerm(Term):
             line, *of_line = _at_line(job.tracer.scene, textures, at)
             along, across = (
                 dr.select(at.on_texture, new, old) for new, old in zip(of_line, (along, across), strict=True)
+            )
+        if border is not None:
+            of_border = partial(job.boundaries.shown.across, job.tracer.scene, border)
+            changes = (
+                change_of(job.tracer.scene, of_border, at.a.ray, at.a.pi, way, border.found)
+                for way in (at.along, at.across)
+            )
+            along, across = (
+                dr.select(at.on_cast_shadow, new, old) for new, old in zip(changes, (along, across), strict=True)
             )
         total = dr.square(along) + dr.square(across)
         usable = at.found & (total > 0) & dr.isfinite(total)
@@ -177,6 +191,10 @@ class BisectionTerm(Term):
                 on_line = usable & at.on_texture
                 si = surface_met(job.tracer.scene, ray, at.a.pi, mi.RayFlags.All, on_line)
                 g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, si), 0), g)
+            if border is not None:
+                there = usable & border.found & at.on_cast_shadow
+                si = surface_met(job.tracer.scene, ray, at.a.pi, mi.RayFlags.All, there)
+                g = dr.select(at.on_cast_shadow, dr.select(there, of_border(si), 0), g)
         return dr.select(usable, -segment.weight * along / total, 0), g
 
 
@@ -185,7 +203,7 @@ def _at_outline(scene: mi.Scene, at: Parting, segment: Segment) -> tuple[Touch, 
     a, b = (at.a.ray, at.a.pi), (at.b.ray, at.b.pi)
     a_is_near = at.a.pi.t <= at.b.pi.t
     near, far = (tuple(dr.select(a_is_near, x, y) for x, y in zip(p, q, strict=True)) for p, q in ((a, b), (b, a)))
-    active = at.found & ~at.on_texture & near[1].is_valid()
+    active = at.found & ~at.on_texture & ~at.on_cast_shadow & near[1].is_valid()
     reach = segment.length * dr.norm(at.along.o + near[1].t * at.along.d)
     touch = touch_outline(scene, at.a.ray, near, far, reach, active)
     return touch, *(-dr.dot(touch.n, way.o + touch.t * way.d) for way in (at.along, at.across))
@@ -194,17 +212,18 @@ def _at_outline(scene: mi.Scene, at: Parting, segment: Segment) -> tuple[Touch, 
 def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch, mi.Float, mi.Float] | None) -> Parting:
     """What is seen on both sides of a jump, a little farther aside than it is known.
 
-    Close to the edges of mirrors and glass, and to lines in which surfaces cut each other, rays start beyond the other
-    surface. Close to a line of a texture, few numbers are left in single precision, and often one of both rays meets
-    the line itself, which may belong to either side: to Mitsuba's `checkerboard`, to the other one. This looks past
-    that, unless other faces, or other parts of the texture, are there.
+    Close to the edges of mirrors and glass, to inner edges of acute corners, and to lines in which surfaces cut each
+    other, rays start beyond the other surface. Close to a line of a texture, few numbers are left in single
+    precision, and often one of both rays meets the line itself, which may belong to either side: to Mitsuba's
+    `checkerboard`, to the other one. This looks past that, unless other faces, or other parts of the texture, are
+    there.
     """
     aside = dr.zeros(mi.Float, dr.width(at.found))
     if outline is not None:
         touch, along, _ = outline
-        lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, dr.select(touch.cut, BESIDE_CUT, 0))
+        lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, _overhang(at, segment))
         aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
-        aside = dr.select(~at.on_texture & ~at.grazes, aside, 0)
+        aside = dr.select(~at.on_texture & ~at.on_shadow & ~at.grazes, aside, 0)
     if chains.textures is not None:
         line, along, _ = _at_line(chains.tracer.scene, chains.textures, at)
         si = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, at.found & at.on_texture)
@@ -223,6 +242,22 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
         usable &= (v.pi.shape == w.pi.shape) & (v.pi.instance == w.pi.instance) & same & (v.depth == w.depth)
     a, b = (dr.select(usable, new, old) for new, old in ((other.a, at.a), (other.b, at.b)))
     return replace(at, a=a, b=b)
+
+
+def _at_shadow(chains: Chains, at: Parting, segment: Segment) -> Border:
+    active = at.found & at.on_shadow
+    a, b = (v.pi.compute_surface_interaction(v.ray, mi.RayFlags.All, active) for v in (at.a, at.b))
+    return chains.shown.border(chains.tracer.scene, a, b, segment.choice, active, at.on_cast_shadow)
+
+
+def _overhang(at: Parting, segment: Segment) -> mi.Float:
+    """Where both rays meet surfaces that touch each other: how far beside that line they start below the other one, in
+    units of the offset of rays."""
+    a, b = (v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, at.found) for v in (at.a, at.b))
+    apart = segment.length * dr.norm(at.along.o + a.t * at.along.d)
+    meet = a.is_valid() & b.is_valid() & (dr.norm(a.p - b.p) <= NEXT * apart + rounding(a.p, at.a.ray.o))
+    normals = (dr.mulsign(si.n, -dr.dot(si.n, ray.d)) for si, ray in ((a, at.a.ray), (b, at.b.ray)))
+    return dr.select(meet, overhang(*normals), 0)
 
 
 def _goes_on(vertex: Vertex) -> mi.Bool:

@@ -17,7 +17,7 @@ from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.meshes import surfaces
 from rimlight.edge_sampling.geometry.surfaces import components
-from rimlight.edge_sampling.rays import lift, spawn_ray
+from rimlight.edge_sampling.rays import spawn_ray, starts_in
 
 from .log import Log
 from .paths import Vertex
@@ -31,9 +31,6 @@ APART = 3.0
 #: What rounding may add to the distance of two points, in units in the last place of their coordinates; and to the
 #: difference of two normals.
 ROUNDING, BENT = 256, 1e-3
-
-#: A ray that meets something within this part of the offset of rays starts in the face that it meets.
-AT_START = 0.5
 
 #: Part of a pixel by which film positions differ of which derivatives along the film are made.
 STEP = 0.25
@@ -220,6 +217,7 @@ class Link:
     lobe : mi.UInt32, 0 if there is no next vertex, 1 if the next ray has the same direction, 2 if it is reflected, 3
         if it is refracted; and 4 more, if interpolated normals send it to the wrong side of its face.
     numbers : random numbers.
+    dark : mi.Bool, is it in the shadow of a light, as far as mirrors show it?
     """
 
     seen: Seen
@@ -227,6 +225,7 @@ class Link:
     ways: tuple[RayDerivative, ...]
     lobe: mi.UInt32
     numbers: Numbers
+    dark: mi.Bool
 
 
 @dataclass
@@ -235,7 +234,7 @@ class Parting:
 
     a, b : the vertices at which they do: what the same ray of both meets.
     along, across : derivatives of the ray to a.
-    on_texture : mi.Bool, is it at a line of a texture?
+    on_texture : mi.Bool, is it at a line of a texture? on_shadow : at the border of a shadow?
     grazes : mi.Bool, is it where the ray passes from one side of the face from which it starts to the other?
     found : mi.Bool, do they, in a way that is no edge as the camera sees it?
     """
@@ -245,8 +244,15 @@ class Parting:
     along: RayDerivative
     across: RayDerivative
     on_texture: mi.Bool
+    on_shadow: mi.Bool
     grazes: mi.Bool
     found: mi.Bool
+
+    @property
+    def on_cast_shadow(self) -> mi.Bool:
+        """Is it at the border of a shadow inside of a face? At an edge, the shadow begins since one of both faces turns
+        away from the light."""
+        return self.on_shadow & (self.a.pi.prim_index == self.b.pi.prim_index)
 
 
 class Chains:
@@ -257,7 +263,7 @@ class Chains:
 
     def __init__(self, tracer: PathTracer, rays: FilmRays, boundaries: Boundaries):
         self.tracer, self.rays, self.surfaces = tracer, rays, boundaries.surfaces
-        self.mirrors, self.textures = boundaries.mirrors, boundaries.textures
+        self.mirrors, self.textures, self.shown = boundaries.mirrors, boundaries.textures, boundaries.shown
         bsdfs = [s.bsdf().flags() for s in surfaces(tracer.scene) if s.bsdf() is not None]
         self._any_mask = self.mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
 
@@ -315,7 +321,15 @@ class Chains:
             dr.select(textured, dr.norm(mi.Vector2f(*components(at, si.dp_du, si.dp_dv))), 0),
             mi.Bool(False),
         )
-        return Link(seen, onwards, beyond, lobe, numbers)
+        return Link(seen, onwards, beyond, lobe, numbers, self._in_shadow(si, vertex.depth, choice, met))
+
+    def _in_shadow(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, choice: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Is a point in the shadow of a light? (Shadows on what the camera sees itself are found from the light.)"""
+        if self.shown is None:
+            return mi.Bool(False)
+        active = active & (depth > 1) & self.tracer.scatters(depth)
+        active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+        return active & self.shown.hidden(self.tracer.scene, si, choice, active)
 
     def _is_mask(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """Does light go through it in part, while the rest is scattered?
@@ -342,7 +356,7 @@ class Chains:
             link = self.link(vertex, (derivative,), choice, active)
             found = link.seen
             found.way = mi.sample_tea_32(seen.way, (found.way << 3) + link.lobe)[0]
-            found.cells = mi.sample_tea_32(seen.cells, found.cells)[0]
+            found.cells = mi.sample_tea_32(seen.cells, dr.select(link.dark, ~found.cells, found.cells))[0]
             found.shown = mi.Bool(seen.shown)
             goes_on = active & (link.lobe > 0)
             found = dr.select(active, found, seen)
@@ -376,14 +390,16 @@ class Chains:
         rays, axis, choice = self.rays, segment.axis, segment.choice
         aside = mi.Vector2f(axis.y, axis.x)
 
-        def step(a, b, of_a, of_b, shown, on_texture, grazes, found, active):
+        def step(a, b, of_a, of_b, shown, on_texture, on_shadow, grazes, found, active):
             here, there = self.link(a, of_a, choice, active), self.link(b, of_b, choice, active)
             same_shape = here.seen.way == there.seen.way
             # Is one of both on the wrong side of its face? If that is another face, they part at the edge.
             turns, same_face = (here.lobe ^ there.lobe) == 4, a.pi.prim_index == b.pi.prim_index
             parts = ~same_shape | here.seen.is_apart_from(there.seen, segment.length) | (turns & ~same_face)
-            on_line = active & ~parts & ~grazes & (here.seen.cells != there.seen.cells)
-            on_texture |= on_line
+            differ = here.seen.cells != there.seen.cells
+            on_line = active & ~parts & ~grazes & (differ | (here.dark != there.dark))
+            on_texture |= on_line & differ
+            on_shadow |= on_line & ~differ
             found |= (active & (parts | grazes) & shown & ~self._starts_beyond(a, b)) | on_line
             goes_on = active & ~parts & ~grazes & ~on_line & (here.lobe > 0) & ((here.lobe == there.lobe) | turns)
             grazes |= goes_on & turns
@@ -393,18 +409,19 @@ class Chains:
             a, b = (dr.select(goes_on, after(v, link), v) for v, link in ((a, here), (b, there)))
             of_a = tuple(dr.select(goes_on, new, old) for new, old in zip(here.ways, of_a, strict=True))
             of_b = tuple(dr.select(goes_on, new, old) for new, old in zip(there.ways, of_b, strict=True))
-            return a, b, of_a, of_b, shown | (goes_on & (here.lobe >= 2)), on_texture, grazes, found, goes_on
+            shown |= goes_on & (here.lobe >= 2)
+            return a, b, of_a, of_b, shown, on_texture, on_shadow, grazes, found, goes_on
 
         if log is not None:
             log.arrive(first[0].depth, first[0], active)
         no = dr.full(mi.Bool, False, dr.width(active))
         of_a = rays.derivative(segment.start, axis), rays.derivative(segment.start, aside)
         of_b = (rays.derivative(segment.end, axis),)
-        state = (*first, of_a, of_b, no, mi.Bool(no), mi.Bool(no), mi.Bool(no), mi.Bool(active))
-        a, b, of_a, _, _, on_texture, grazes, found, _ = dr.while_loop(
+        state = (*first, of_a, of_b, no, *(mi.Bool(no) for _ in range(4)), mi.Bool(active))
+        a, b, of_a, _, _, on_texture, on_shadow, grazes, found, _ = dr.while_loop(
             state, lambda *state: state[-1], step, label="chains of mirrors"
         )
-        return Parting(a, b, *of_a, on_texture, grazes, found)
+        return Parting(a, b, *of_a, on_texture, on_shadow, grazes, found)
 
     def _starts_beyond(self, a: Vertex, b: Vertex) -> mi.Bool:
         """Do two rays part because one of them starts beyond the face that the other one meets?
@@ -413,7 +430,7 @@ class Chains:
         the next face, and show what is behind. The border of such a strip does not count: what looks at the edge looks
         past the strip, the film boundary (`DeviceEdges.farther`) as well as bisection, and has the whole jump.
         """
-        return dr.minimum(a.pi.t, b.pi.t) < AT_START * lift(self.tracer.scene, a.ray.o)
+        return starts_in(self.tracer.scene, a.ray, dr.minimum(a.pi.t, b.pi.t))
 
 
 def _shape_of(pi: mi.PreliminaryIntersection3f) -> mi.UInt32:

@@ -212,3 +212,18 @@ def test_suns_whose_outlines_are_seen(text, bsdf, key, warned):
     scene = cases.scene(sensor=cases.camera(), plate=plate, sky=SKIES[text])
     found = said(scene, key, kind="prb_edge", max_depth=3)
     assert any(text in message for message in found) == warned
+
+
+# ---------------------- Transformations ----------------------
+
+
+@pytest.mark.parametrize(("axis", "count"), [([1, 1, 0], 1), ([0, 1, 0], 0)])
+def test_axes_that_are_not_of_unit_length_are_warned_about(axis, count):
+    """`rotate` shears then, and the inverse that Mitsuba keeps is another one."""
+    place = mi.ScalarTransform4f().translate([0, 0, 1]).rotate(axis, 20)
+    thing = {"type": "disk", "id": "thing", "to_world": place}
+    messages = said(
+        cases.scene(sensor=cases.camera((0, 0, -5), (0, 0, 0)), thing=thing, sky=cases.constant()), "sensor.to_world"
+    )
+    assert len(messages) == count
+    assert all('wrong for "thing"' in m for m in messages)

@@ -22,6 +22,8 @@ INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb
         (mirrors.over_mirror, "mirror.vertex_positions"),
         (mirrors.two_mirrors, "sensor.to_world"),
         (mirrors.glass_ball, "ball.to_world"),
+        (mirrors.shadow_in_wall, "cube.vertex_positions"),
+        (mirrors.shadows_of_ball, "ball.to_world"),
         (mirrors.mapped_ball, "ball.vertex_positions"),
         (mirrors.mapped_ball, "ball.bsdf.normalmap.data"),
         (mirrors.bumpy_ball, "ball.to_world"),
@@ -35,8 +37,9 @@ def test_gradients_are_those_of_forward_mode(name, make, key):
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
-def test_frozen_functions(name):
-    assert_frozen_is_unfrozen(mirrors.over_mirror(), mi.load_dict(INTEGRATORS[name]), "cube.vertex_positions")
+@pytest.mark.parametrize("make", [mirrors.over_mirror, mirrors.shadow_in_wall])
+def test_frozen_functions(name, make):
+    assert_frozen_is_unfrozen(make(), mi.load_dict(INTEGRATORS[name]), "cube.vertex_positions")
 
 
 @pytest.mark.parametrize("key", ["ball.vertex_positions", "ball.bsdf.normalmap.data"])
