@@ -32,7 +32,8 @@ def divide(fit: Fit, task: Task, before: Mapping[str, np.ndarray]) -> None:
     latents = fit.latents()
     measured = replace(task, seed=derived_seed(task.seed, 2**31 + 3), show=False, doubt=False)
     try:
-        (shares,) = fit.executor.map(_shares, measured, [(fit.values(latents), way(fit, before, latents))])
+        call = task.target, fit.values(latents), way(fit, before, latents)
+        (shares,) = fit.executor.map(_shares, measured, [call])
     except RuntimeError as error:  # nothing was seen to change, say
         log.warning("the samples are not divided anew: %s", error)
     else:
@@ -41,7 +42,7 @@ def divide(fit: Fit, task: Task, before: Mapping[str, np.ndarray]) -> None:
 
 
 def _shares(
-    renderer: Renderer, task: Task, values: Mapping[str, np.ndarray], change: Mapping[str, np.ndarray]
+    renderer: Renderer, task: Task, target: int, values: Mapping[str, np.ndarray], change: Mapping[str, np.ndarray]
 ) -> tuple[tuple[str, float], ...]:
     return renderer.balance(values, change, task)
 

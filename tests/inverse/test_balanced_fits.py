@@ -68,6 +68,26 @@ def test_each_stage_is_measured_anew(monkeypatch):
     assert [(task.stage, task.width, task.spp) for task in tasks] == [(0, None, 16), (1, 8, 32)]
 
 
+def test_workers_divide_alike(machines):
+    machines.add()
+    problem = replace(SHADOW, balance=True, stage=(Stage(iterations=2, spp=16),))
+    fits = [Fit(problem)]
+    fits[0].run(progress=False)
+    with machines.cluster(problem, 1) as cluster:
+        fits.append(Fit(problem, executor=cluster))
+        fits[1].run(progress=False)
+    here, there = (fit.progress.shares for fit in fits)
+    assert here and there == pytest.approx(here, rel=1e-3)
+
+
+@pytest.mark.parametrize("type_", ["prb_edge", "bdpt_edge"])
+def test_integrators_of_interreflections_divide(type_):
+    fit = Fit(replace(SHADOW, balance=True, integrator={"type": type_, "max_depth": 3}, stage=(Stage(iterations=2),)))
+    fit.run(progress=False)
+    shares = fit.progress.shares
+    assert shares["shadows from lights"] == max(shares.values()) > 1 > min(shares.values())
+
+
 def test_what_has_no_influence_divides_nothing(caplog):
     hidden = Free(key=("light.emitter.radiance.value",), kind="light", rate=1e-12)
     problem = replace(SHADOW, balance=True, free=(hidden,), optimiser="sgd", stage=(Stage(iterations=2),))
