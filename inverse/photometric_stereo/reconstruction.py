@@ -22,7 +22,7 @@ from tqdm import tqdm
 from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
-from . import least_squares, start, taking_back
+from . import least_squares, plausibility, start, taking_back
 from .alternation import Alternations, Course, State, View
 from .dataset import Dataset, angles
 from .direct import Guess
@@ -213,6 +213,7 @@ class Reconstruction:
         if not mi.is_rgb or mi.is_polarized:
             raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
+        plausibility.check(data)
         self.data, self.options, self.after = data, options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
