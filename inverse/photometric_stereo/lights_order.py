@@ -111,11 +111,14 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
             others.append(unexplained)
         elif BETTER * unexplained < given and np.mean(_off(C, B) < off) >= MOST:
             mistakes.append((unexplained, words))
+    # Of turns of the rig, which explain alike, the first
+    least = BETTER * min(mistakes)[0] if mistakes else 0
+    mistake = next(((words, unexplained) for unexplained, words in mistakes if unexplained <= least), None)
     return Order(
         names,
         chance=float(np.mean(np.array(others) <= given)) if others else np.nan,
         unexplained=float(given),
-        mistake=min(mistakes)[::-1] if mistakes else None,
+        mistake=mistake,
         swapped=_swapped(C, A, lit),
     )
 
@@ -135,18 +138,17 @@ def _projector(lights: np.ndarray) -> np.ndarray:
 
 
 def _mistakes(K: int) -> list[tuple[str, np.ndarray]]:
-    """Orders in which people list lights by mistake: in words, and which of the lights given belongs to each image."""
+    """Orders in which people list lights by mistake, the simplest first: in words, and which light belongs to each
+    image."""
     k = np.arange(K)
     found = [("in reverse", k[::-1])]
-    for shift in range(1, K):
-        number = shift if shift <= K // 2 else shift - K
-        places = "a place" if abs(number) == 1 else f"{abs(number)} places"
-        found.append((f"{places} too {'early' if number < 0 else 'late'}", np.roll(k, -shift)))
     text = np.array(sorted(range(K), key=lambda i: str(i + 1)))
-    back = np.argsort(text)
     if (text != k).any():
         found.append(("by number, and the images by their names as text (1, 10, 11, 2)", text))
-        found.append(("by their names as text (1, 10, 11, 2), and the images by number", back))
+        found.append(("by their names as text (1, 10, 11, 2), and the images by number", np.argsort(text)))
+    for shift in sorted(range(1, K), key=lambda shift: min(shift, K - shift)):
+        places = "a place" if (count := min(shift, K - shift)) == 1 else f"{count} places"
+        found.append((f"{places} too {'late' if shift <= K // 2 else 'early'}", np.roll(k, -shift)))
     return found
 
 

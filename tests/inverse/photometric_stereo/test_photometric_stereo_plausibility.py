@@ -161,6 +161,17 @@ def test_a_square_of_lights_may_be_listed_from_any_corner() -> None:
     assert lights_order.judged(values, lights[[0, 3, 6, 1, 4, 2, 7, 5]], names).wrong
 
 
+def test_of_orders_that_explain_alike_the_simplest_is_named() -> None:
+    """These lights are listed a place too late. Half of them too early, they are turned by 180 degrees besides, which
+    turns what bulges into what is hollow."""
+    around = np.random.default_rng(5).uniform(-np.pi / 2, np.pi / 2, 6)
+    around = np.concatenate([around, around + np.pi])
+    lights = np.stack([0.6 * np.cos(around), 0.6 * np.sin(around), np.full(12, 0.8)], 1)
+    values = np.maximum(simulation.spiral(200, 50) @ lights.T, 0)
+    found = lights_order.judged(values, np.roll(lights, 1, 0), [])
+    assert found.mistake is not None and found.mistake[0] == "a place too late"
+
+
 def test_few_images_or_pixels_tell_nothing(folds: Dataset) -> None:
     few = dataclasses.replace(
         folds, values=folds.values[:, :5], lights=folds.lights[:5], intensities=folds.intensities[:5], names=()
