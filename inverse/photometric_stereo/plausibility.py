@@ -72,12 +72,13 @@ def judged(data: Dataset) -> Plausibility:
     )
 
 
-def check(data: Dataset) -> None:
-    """Log what is doubtful about a data set of any size."""
+def check(data: Dataset) -> tuple[str, ...]:
+    """Log what is doubtful about a data set of any size, and return it."""
     step = block(len(data.values))
-    if data.blocks(step)[0].any():
-        for text in judged(data.at(1 / step)).said():
-            log.warning("ps: %s", text)
+    said = judged(data.at(1 / step)).said() if data.blocks(step)[0].any() else []
+    for text in said:
+        log.warning("ps: %s", text)
+    return tuple(said)
 
 
 def block(pixels: int) -> int:

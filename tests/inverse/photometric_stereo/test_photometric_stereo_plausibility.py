@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,16 @@ def test_command_and_page(folds: Dataset, tmp_path: Path, capsys: pytest.Capture
     rows = {"order of the lights": "in 0 % of random orders", "axes of the lights": "mirrored", "black level": "none"}
     for row, value in rows.items():
         assert any(line.startswith(row) and value in line for line in shown.splitlines()), shown
+
+
+def test_a_run_keeps_what_is_doubtful(folds: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    dataset.write(tmp_path / "data", FAULTS["reversed"][0](folds))
+    quick = ["--no-reflectance", "--resolutions", "1", "--iterations", "1", "--max-depth", "2"]
+    assert main(["ps", "run", str(tmp_path / "data"), "--out", str(tmp_path / "out"), *quick]) == 0
+    text = "The lights seem to be listed in reverse"
+    assert text in caplog.text
+    (doubt,) = json.loads((tmp_path / "out" / "metadata.json").read_text("utf-8"))["doubts"]
+    assert text in doubt and text in (tmp_path / "out" / "report.html").read_text("utf-8")
 
 
 def test_large_images_are_made_smaller(folds: Dataset) -> None:
