@@ -19,6 +19,10 @@ FEWEST = 6
 #: Values above this quantile of their pixel count as that: highlights would outweigh all others.
 CAPPED = 0.8
 
+#: Of what is not common to all images, two more dimensions must explain at least this part, as normals do of a diffuse
+#: surface: else the images do not tell the order of their lights, such as those of chrome, nearly all of it black.
+TOLD = 0.2
+
 #: Random orders with which the given one is compared, and the largest part of them that may explain values as well.
 ORDERS, CHANCE = 300, 0.05
 
@@ -40,7 +44,7 @@ TRIED = 20
 @dataclass(frozen=True)
 class Order:
     """names : of the images. chance : part of random orders that explain the values as well as the given one; NaN where
-    it cannot be told. unexplained : part of the squared values. mistake : an order that leaves much less, in words, and
+    it is not told. unexplained : part of the squared values. mistake : an order that leaves much less, in words, and
     how much. swapped : numbers of two lights, and how far their images are off what the others predict, now and
     then."""
 
@@ -62,7 +66,7 @@ class Order:
 
     def __str__(self) -> str:
         if np.isnan(self.chance):
-            return "not judged, too few images"
+            return "not judged, too few images, or hardly any light"
         return (
             f"{100 * self.unexplained:.2g} % of the squared values unexplained, in {100 * self.chance:.0f} % of random "
             "orders as little"
@@ -99,6 +103,9 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     if len(lit) < FEWEST:
         return Order(names)
     C, rng = _products(values[:, lit]), np.random.default_rng(0)
+    *_, third, second, first = np.linalg.eigvalsh(C)
+    if second + third < TOLD * (1 - first):
+        return Order(names)
     projector = lambda order: _projector(lights[order[lit]])
     A = projector(np.arange(len(lights)))
     given, off, others, mistakes = 1 - (C * A).sum(), _off(C, A), [], []

@@ -174,13 +174,14 @@ def test_a_square_of_lights_may_be_listed_from_any_corner() -> None:
 
 def test_of_orders_that_explain_alike_the_simplest_is_named() -> None:
     """These lights are listed a place too late. Half of them too early, they are turned by 180 degrees besides, which
-    turns what bulges into what is hollow."""
-    around = np.random.default_rng(5).uniform(-np.pi / 2, np.pi / 2, 6)
-    around = np.concatenate([around, around + np.pi])
-    lights = np.stack([0.6 * np.cos(around), 0.6 * np.sin(around), np.full(12, 0.8)], 1)
-    values = np.maximum(simulation.spiral(200, 50) @ lights.T, 0)
-    found = lights_order.judged(values, np.roll(lights, 1, 0), [])
-    assert found.mistake is not None and found.mistake[0] == "a place too late"
+    turns what bulges into what is hollow: rounding decides which of both explains more."""
+    for seed in range(8):
+        around = np.random.default_rng(seed).uniform(-np.pi / 2, np.pi / 2, 6)
+        around = np.concatenate([around, around + np.pi])
+        lights = np.stack([0.6 * np.cos(around), 0.6 * np.sin(around), np.full(12, 0.8)], 1)
+        values = np.maximum(simulation.spiral(200, 50) @ lights.T, 0)
+        found = lights_order.judged(values, np.roll(lights, 1, 0), [])
+        assert found.mistake is not None and found.mistake[0] == "a place too late"
 
 
 def test_few_images_or_pixels_tell_nothing(folds: Dataset) -> None:
@@ -196,9 +197,10 @@ def test_few_images_or_pixels_tell_nothing(folds: Dataset) -> None:
     assert [value.split(",")[0] for _, value in plausibility.judged(small).rows()] == ["not judged"] * 3
 
 
-@pytest.mark.parametrize("seed", [1022, 1040, 1053])
+@pytest.mark.parametrize("seed", [1022, 1040, 1053, 7018])
 def test_random_sets_are_what_their_files_say(seed: int) -> None:
-    """Chrome under clipped lights; bronze; nine lights, of which one is wrong, on silver paint."""
+    """Chrome under clipped lights; bronze; nine lights, of which one is wrong, on silver paint; chrome and an acrylic,
+    of which four of five values are black."""
     data, _, row = random_photometric.make(seed)
     assert plausibility.judged(data).said() == [], row.label
 
