@@ -65,7 +65,8 @@ def judged(pictured: np.ndarray, away: np.ndarray) -> BlackLevel:
     median = np.median(pictured)
     if away.sum() < FEWEST or np.mean(away.sum(0) >= OF_AN_IMAGE) < IMAGES or median <= 0:
         return BlackLevel()
-    darkest, level = np.quantile(pictured[away], [DARKEST, NEXT])
-    part = level / median
-    close = darkest > CLOSE * level and np.mean(pictured < CLOSE * level) <= DARKER
-    return BlackLevel(float(level), float(part)) if close and part > LEAST else BlackLevel(0.0, 0.0)
+    darkest, next_ = np.quantile(pictured[away], [DARKEST, NEXT])
+    close = darkest > CLOSE * next_ and np.mean(pictured < CLOSE * next_) <= DARKER
+    if not close or darkest <= LEAST * median:
+        return BlackLevel(0.0, 0.0)
+    return BlackLevel(float(darkest), float(darkest / median))  # on top comes what the surface reflects on itself

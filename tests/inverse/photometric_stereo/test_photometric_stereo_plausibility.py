@@ -205,6 +205,36 @@ def test_random_sets_are_what_their_files_say(seed: int) -> None:
     assert plausibility.judged(data).said() == [], row.label
 
 
+@pytest.mark.parametrize("name", ["ball", "bear"])
+def test_photographs(shared, name: str) -> None:
+    """Of DiLiGenT: nothing is said as they are, and what is wrong if it is."""
+    data = dataset.read(shared(f"diligent/{name}PNG"), images=32)
+    data = data.at(1 / plausibility.block(len(data.values)))
+    assert plausibility.judged(data).said() == []
+    order = np.arange(32)
+    for change, text in (
+        (lambda d: listed(d, order[::-1]), "in reverse"),
+        (lambda d: listed(d, np.random.default_rng(1).permutation(32)), "in another order"),
+        (lambda d: with_axes(d, "x -y"), "write x -y for x y if the object bulges"),
+        (lambda d: with_axes(d, "y x"), "write y x for x y if the object bulges"),
+        (lambda d: with_axes(d, "y -x"), "write -y x for x y if the object bulges"),
+    ):
+        (said,) = plausibility.judged(change(data)).said()
+        assert text in said, said
+    pictured = data.values * data.intensities
+    level = 0.05 * np.median(pictured)
+    brighter = dataclasses.replace(data, values=((pictured + level) / data.intensities).astype(np.float32))
+    (said,) = plausibility.judged(brighter).said()
+    assert "seems to be added" in said
+    assert abs(plausibility.judged(brighter).black_level.level / level - 1) < 0.3
+
+
+def test_inspection_of_large_photographs(shared) -> None:
+    found = inspection.inspect(shared("diligent/ballPNG")).plausibility
+    assert found.said() == [] and found.axes.curls["mirrored"] > 4 * found.axes.curls["as given"]
+    assert found.order.chance == 0
+
+
 # ------------------------------------------------------------------ parts
 
 
