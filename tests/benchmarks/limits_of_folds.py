@@ -2,13 +2,14 @@
 
 python tests/benchmarks/limits_of_folds.py [--size 48] [--seed 21]
 
-Results of images with and without interreflections; and the interreflections that are path traced from the true
-normals, beside those of the images.
+Results of images with and without interreflections; the interreflections that are path traced from the true normals,
+beside those of the images; results with these held; and the errors of many alternations.
 """
 
 from __future__ import annotations
 
 import argparse
+from unittest import mock
 
 # isort: off
 import rimlight  # noqa: F401  (first: it chooses the LLVM library)
@@ -17,7 +18,7 @@ import numpy as np
 # isort: on
 
 from rimlight import ggx
-from rimlight.inverse.photometric_stereo import reconstruction, rendering, simulation, start
+from rimlight.inverse.photometric_stereo import alternation, reconstruction, rendering, simulation, start
 from rimlight.inverse.photometric_stereo.dataset import LUMINANCE, Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import Guess
 
@@ -36,24 +37,34 @@ def figure(size: int, seed: int, depth: int, **changed) -> Dataset:
     return simulation.simulate(options, progress=False)[0]
 
 
-def result(data: Dataset, depth: int, coat: bool) -> tuple[float, reconstruction.Result]:
+def result(data: Dataset, depth: int, coat: bool, **changed) -> tuple[float, reconstruction.Result]:
     """Error of the start, degrees, and what is found with several materials."""
-    options = reconstruction.Options(
-        brightness=0, max_depth=depth, resolutions=(0.5, 1.0), iterations=(6, 4), materials="several", coat=coat
-    )
+    given = {"resolutions": (0.5, 1.0), "iterations": (6, 4)} | changed
+    options = reconstruction.Options(brightness=0, max_depth=depth, materials="several", coat=coat, **given)
     found = reconstruction.reconstruct(data, options, progress=False)
     begun = start.guess(data, found.lobes, start.counts(data, data, 1.0, options.dark), options)
     return float(angles(begun.normals, data.truth).mean()), found
 
 
 def indirect(data: Dataset, lobes: ggx.Lobes, weights: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Luminances of interreflections from the true normals, (P, K). base : diffuse colours under the glaze, (P, 3)."""
+    """Interreflections from the true normals, (P, K, 3). base : diffuse colours under the glaze, (P, 3)."""
     P, K, _ = data.values.shape
     eta = simulation.GLAZE[1]
     guess = Guess(data.truth.copy(), np.ones(P), np.ones(K), weights, base, eta)
     scene = rendering.Rendering(data, lobes, max_depth=5, several=True, base_eta=eta)
     scene.update(guess, scene.domain.integrate(data.truth))
-    return scene.indirect(spp=SPP, seed=3) @ LUMINANCE
+    return scene.indirect(spp=SPP, seed=3)
+
+
+def with_held(data: Dataset, light: np.ndarray) -> float:
+    """Error of the result under a coat, if these are the interreflections of all its states, degrees."""
+    half = data.blocks(2)[1](light)
+
+    def held(self: rendering.Rendering, *, spp: int, seed: int) -> np.ndarray:
+        return (light if len(self.data.values) == len(light) else half).astype(np.float32)
+
+    with mock.patch.object(rendering.Rendering, "indirect", held):
+        return result(data, 4, True, smoothing=0.0)[1].error
 
 
 def main() -> None:
@@ -70,7 +81,8 @@ def main() -> None:
                 direct = found
     exact = {"spp": SPP, "noise": 0.0}
     whole, without = figure(args.size, args.seed, 5, **exact), figure(args.size, args.seed, 2, **exact)
-    true = (whole.values - without.values) @ LUMINANCE
+    true, noisy = whole.values - without.values, figure(args.size, args.seed, 5)
+    print(f"interreflections of the images, held: {with_held(noisy, true):.2f} degrees", flush=True)
     light = direct.guess.base[:, 0] > (DARK[0] + LIGHT[0]) / 2
     colours = np.where(light[:, None], LIGHT, DARK)
     alpha, eta = simulation.GLAZE
@@ -83,11 +95,15 @@ def main() -> None:
         ("glaze and colours found", found_glaze, direct.guess.base),
         ("true colours, no gloss", (glaze[0], 0 * glaze[1]), colours),
     ):
-        of_truth = indirect(whole, *of_glaze, base)
-        alike = np.corrcoef(of_truth.ravel(), true.ravel())[0, 1]
-        print(
-            f"{words}: {of_truth.sum() / true.sum():.2f} of the interreflections, correlation {alike:.3f}", flush=True
-        )
+        light = indirect(whole, *of_glaze, base)
+        of_truth, of_images = light @ LUMINANCE, true @ LUMINANCE
+        alike, part = np.corrcoef(of_truth.ravel(), of_images.ravel())[0, 1], of_truth.sum() / of_images.sum()
+        error = with_held(noisy, light)
+        print(f"{words}: {part:.2f} of the interreflections, correlation {alike:.3f}; held: {error:.2f}", flush=True)
+    with mock.patch.object(alternation, "PATIENCE", 99):
+        _, many = result(noisy, 4, True, iterations=(12, 12))
+    errors = [f"{entry['error']:.2f}" for entry in many.history if entry["size"] == 1]
+    print(f"twelve alternations at full size: {' '.join(errors)}; kept: {many.error:.2f} degrees")
 
 
 if __name__ == "__main__":
