@@ -164,38 +164,49 @@ class Dataset:
         mask, mean = self.blocks(step)
         if not mask.any():
             raise InputError(f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left")
-        camera = self.camera
-        if camera is not None:  # the centre of the first coarse pixel lies (step - 1) / 2 behind that of the first
-            camera = camera.copy()
-            camera[:2, 2] -= (step - 1) / 2
-            camera[:2] /= step
+        camera = coarser(self.camera, step)
         truth = None if self.truth is None else unit(mean(self.truth))
         return replace(self, values=mean(self.values).astype(np.float32), mask=mask, camera=camera, truth=truth)
 
     def blocks(self, step: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
         """Coarse pixels, of step x step of these: their mask, where at least half of a block is in the mask; and what
         makes means, (P', ...), over each block's pixels of the mask, of numbers of all pixels, (P, ...)."""
-        H, W = (-(-n // step) * step for n in self.mask.shape)
-        mask = np.zeros((H, W), bool)
-        mask[: self.mask.shape[0], : self.mask.shape[1]] = self.mask
-        coarse = mask.reshape(H // step, step, W // step, step).sum((1, 3)) * 2 >= step * step
-        # Coarse pixel of each pixel, and means by sums over them
-        target = np.full(coarse.shape, -1)
-        target[coarse] = np.arange(coarse.sum())
-        rows, columns = np.nonzero(self.mask)
-        group = target[rows // step, columns // step]
-        members = np.flatnonzero(group >= 0)
-        members = members[np.argsort(group[members], kind="stable")]
-        first = np.flatnonzero(np.diff(group[members], prepend=-1))
-        counts = np.diff(first, append=len(members))
-        mean = lambda x: np.add.reduceat(x[members], first, axis=0) / counts.reshape(-1, *[1] * (x.ndim - 1))
-        return coarse, mean
+        return blocks(self.mask, step)
 
     def image(self, pixels: np.ndarray, fill: float = 0) -> np.ndarray:
         """(H, W, ...) of numbers of the pixels, (P, ...)."""
         found = np.full((*self.mask.shape, *pixels.shape[1:]), fill, pixels.dtype)
         found[self.mask] = pixels
         return found
+
+
+def blocks(mask: np.ndarray, step: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Of the pixels of a mask, (H, W): see `Dataset.blocks`."""
+    H, W = (-(-n // step) * step for n in mask.shape)
+    whole = np.zeros((H, W), bool)
+    whole[: mask.shape[0], : mask.shape[1]] = mask
+    coarse = whole.reshape(H // step, step, W // step, step).sum((1, 3)) * 2 >= step * step
+    # Coarse pixel of each pixel, and means by sums over them
+    target = np.full(coarse.shape, -1)
+    target[coarse] = np.arange(coarse.sum())
+    rows, columns = np.nonzero(mask)
+    group = target[rows // step, columns // step]
+    members = np.flatnonzero(group >= 0)
+    members = members[np.argsort(group[members], kind="stable")]
+    first = np.flatnonzero(np.diff(group[members], prepend=-1))
+    counts = np.diff(first, append=len(members))
+    mean = lambda x: np.add.reduceat(x[members], first, axis=0) / counts.reshape(-1, *[1] * (x.ndim - 1))
+    return coarse, mean
+
+
+def coarser(camera: np.ndarray | None, step: int) -> np.ndarray | None:
+    """The camera whose pixels are blocks of step x step."""
+    if camera is None:
+        return None
+    camera = camera.copy()
+    camera[:2, 2] -= (step - 1) / 2  # the centre of the first block lies so far behind that of the first pixel
+    camera[:2] /= step
+    return camera
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

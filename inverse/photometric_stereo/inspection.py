@@ -3,7 +3,7 @@ pixels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,9 @@ from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.inverse.page import shrunk
 
-from . import cost, dataset, encoding, evidence, files, least_squares, start
+from . import cost, dataset, encoding, evidence, files, least_squares, plausibility, start
 from .dataset import Dataset
+from .plausibility import Plausibility
 from .reconstruction import Options
 from .vectors import LUMINANCE, every
 
@@ -43,6 +44,7 @@ class Inspection:
     last is an estimate. exposures : (K,), estimated. directions : (K, 3), of the lights, from the object.
     small : the images, shrunk, linear. mean : of all images, (H, W, 3), linear, with the mask beside it.
     misfits : of a diffuse surface to the images, as they are, and decoded from sRGB; None where this says nothing.
+    plausibility : are the data what their files say?
     """
 
     folder: Path
@@ -59,6 +61,7 @@ class Inspection:
     small: list[np.ndarray]
     mean: np.ndarray
     misfits: tuple[float, float] | None
+    plausibility: Plausibility
     options: Options
 
     @property
@@ -112,11 +115,16 @@ def inspect(folder: Path, options: Options | None = None) -> Inspection:
     raw = np.empty((len(chosen), len(names), 3), np.float32)
     largest, bright, black = (np.zeros(len(names)) for _ in range(3))
     mean, small = np.zeros((*mask.shape, 3), np.float32), []
+    step = plausibility.block(pixels)
+    coarse, mean_of_blocks = dataset.blocks(mask, step)
+    blocks = np.empty((coarse.sum(), len(names), 3), np.float32)
     for k, name in enumerate(tqdm(names, desc="images", disable=None, leave=False)):
         picture = files.read_pixels(folder / name, np.ones_like(mask)).reshape(*mask.shape, 3)
         inside, raw[:, k] = picture[mask], picture.reshape(-1, 3)[chosen]
         if not np.isfinite(inside).all():
             raise InputError(f'ps: "{name}" has values that are not finite; take these pixels out of the mask')
+        if coarse.any():
+            blocks[:, k] = mean_of_blocks(inside) / setup.intensities[k]
         largest[k] = inside.max(initial=0)
         bright[k] = (inside >= (1 - 1e-4) * largest[k]).any(1).mean() if pixels else 0
         black[k] = (inside <= 0).all(1).mean() if pixels else 0
@@ -140,6 +148,7 @@ def inspect(folder: Path, options: Options | None = None) -> Inspection:
         small=small,
         mean=mean,
         misfits=_misfits(raw, setup),
+        plausibility=_plausibility(blocks, coarse, replace(setup, camera=dataset.coarser(setup.camera, step))),
         options=options,
     )
 
@@ -169,7 +178,8 @@ def warnings(found: Inspection) -> list[str]:
             f"A reconstruction would take {found.memory / 2**30:.1f} GiB of memory, of which {there / 2**30:.1f} GiB "
             "are available, and will be refused: use fewer --images, or --resolutions 0.25 0.5 with --iterations 10 6."
         )
-    if found.misfits is not None and found.misfits[1] < found.misfits[0]:
+    said += found.plausibility.said()
+    if found.plausibility.order.known and found.misfits is not None and found.misfits[1] < found.misfits[0]:
         said.append(
             "The pictures look like exports for the screen (sRGB), and PNG and TIFF are taken to be linear: decoded, "
             f"they fit a diffuse surface better ({100 * found.misfits[1]:.1f} % off instead of "
@@ -215,6 +225,7 @@ def table(found: Inspection) -> list[tuple[str, str]]:
         rows.append(("off a diffuse surface", f"{linear} as linear, {decoded} decoded from sRGB"))
     return [
         *rows,
+        *found.plausibility.rows(),
         ("memory, at most", f"{found.memory / 2**30:.1f} GiB"),
         ("time, roughly", f"{_duration(found.seconds / 2)} to {_duration(found.seconds * 2)}"),
     ]
@@ -238,6 +249,11 @@ def _estimates(sample: Dataset, options: Options) -> tuple[np.ndarray, np.ndarra
     return (values <= dark).mean(0), guess.exposures, plane.mean_directions()
 
 
+def _plausibility(values: np.ndarray, mask: np.ndarray, setup: dataset.Setup) -> Plausibility:
+    """Of means over blocks of pixels."""
+    return plausibility.judged(setup.dataset(values, mask)) if mask.any() else Plausibility()
+
+
 def _misfits(raw: np.ndarray, setup: dataset.Setup) -> tuple[float, float] | None:
     """Of PNG and TIFF, under lights at infinity."""
     if setup.near or not all(name.lower().endswith(files.LINEAR) for name in setup.names):
@@ -259,7 +275,8 @@ def _of_images(found: Inspection) -> list[str]:
             f"More than {100 * BLACK:.0f} % of {listed(which)} is black: was the lamp on? If not, take its line out of "
             f"{files.NAMES} and of the files of the lights."
         )
-    if len(which := np.flatnonzero(np.abs(np.log(found.exposures)) > np.log(OFF))):
+    which = np.flatnonzero(np.abs(np.log(found.exposures)) > np.log(OFF))
+    if len(which) and found.plausibility.order.known:
         said.append(
             f"The exposure of {listed(which)} seems to be off what {files.INTENSITIES} says by more than "
             f"{100 * (OFF - 1):.0f} %. That is estimated and put right by default: do not give --no-exposures."

@@ -95,7 +95,7 @@ def integrate(
     if not tolerance > 0 or max_iterations < 1:
         raise InputError(f"integrate: tolerance {tolerance} and max_iterations {max_iterations} must be positive")
     n = _unit_normals(normals, mask)
-    rays, steps = _rays(mask, camera, pixel_size)
+    rays, steps = view_rays(mask, camera, pixel_size)
     cosine = -np.sum(n * rays, axis=1) / np.linalg.norm(rays, axis=1)
     cosine = np.maximum(cosine, LEAST_COSINE)
     by_default = cosine if bilateral is None else cosine**2
@@ -193,7 +193,7 @@ def _least_squares(equations: Sequence[_Equations], weights: Sequence[np.ndarray
     return laplacian.solve(A, total(second, flux) - total(first, flux) + inertia * q, q)
 
 
-def _rays(mask: np.ndarray, camera: np.ndarray | None, pixel_size: float) -> tuple[np.ndarray, np.ndarray]:
+def view_rays(mask: np.ndarray, camera: np.ndarray | None, pixel_size: float) -> tuple[np.ndarray, np.ndarray]:
     """Rays r through the pixels of the mask, (P, 3); and their derivatives, to the next column and row, (2, 3)."""
     v, u = np.nonzero(mask)
     if camera is None:
@@ -211,7 +211,7 @@ def _points(depth: np.ndarray, mask: np.ndarray, camera: np.ndarray | None, pixe
     """Points that the pixels of the mask show, (P, 3), camera coordinates."""
     z = np.asarray(depth, np.float64)[mask]
     if camera is not None:
-        return z[:, None] * _rays(mask, camera, pixel_size)[0]
+        return z[:, None] * view_rays(mask, camera, pixel_size)[0]
     v, u = np.nonzero(mask)
     return np.stack([pixel_size * u, -pixel_size * v, z], 1)
 

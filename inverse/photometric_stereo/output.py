@@ -81,6 +81,7 @@ def write_numbers(
         "halves": {name: None if np.isnan(angle) else angle for name, angle in result.halves.items()},
         "curl": {name: None if np.isnan(angle) else angle for name, angle in result.curl.items()},
         "taken_back": result.taken_back,
+        "doubts": list(result.doubts),
         "seconds": round(result.seconds, 3),
         "size": [*data.mask.shape[::-1]],
         "pixels": len(data.values),

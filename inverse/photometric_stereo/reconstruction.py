@@ -22,7 +22,7 @@ from tqdm import tqdm
 from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
-from . import least_squares, start, taking_back
+from . import least_squares, plausibility, start, taking_back
 from .alternation import Alternations, Course, State, View
 from .dataset import Dataset, angles
 from .direct import Guess
@@ -137,8 +137,9 @@ class Result:
     predictions of "start" and "result" are off, in the mean value of each pixel. halves : of both, the mean angle
     between normals of one half of the lights and of the other, degrees. curl : of both, that between normals and those
     of the depth that is integrated from them. taken_back : part of the surface whose normals are those of the start.
-    history : for each alternation, the size of the images, seconds since the start, the root mean square residual over
-    the median value, and where the truth is known the mean angular error, degrees."""
+    doubts : what is probably wrong with the data, in sentences. history : for each alternation, the size of the images,
+    seconds since the start, the root mean square residual over the median value, and where the truth is known the mean
+    angular error, degrees."""
 
     data: Dataset
     lobes: ggx.Lobes
@@ -153,6 +154,7 @@ class Result:
     halves: dict[str, float] = field(default_factory=dict)
     curl: dict[str, float] = field(default_factory=dict)
     taken_back: float = 0.0
+    doubts: tuple[str, ...] = ()
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -213,6 +215,7 @@ class Reconstruction:
         if not mi.is_rgb or mi.is_polarized:
             raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
+        self.doubts = plausibility.check(data)
         self.data, self.options, self.after = data, options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
@@ -336,6 +339,7 @@ class Reconstruction:
             halves={"start": now.start.halves, "result": best.halves},
             curl={"start": now.start.curl, "result": best.curl},
             taken_back=1.0 if best.start else now.back,
+            doubts=self.doubts,
             history=now.history,
             seconds=now.seconds,
         )

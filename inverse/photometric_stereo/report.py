@@ -144,7 +144,11 @@ def _verdict(view: View, result: Result, status: str) -> str:
     facts.append(f"residual {number(100 * result.history[-1]['residual'], 2)} % of the median value")
     facts += output.judgement(result)
     kind = "status" if status == "finished" else "status bad"
-    return f'<p class="verdict"><span class="{kind}">{html.escape(status)}</span>: {html.escape("; ".join(facts))}</p>'
+    verdict = (
+        f'<p class="verdict"><span class="{kind}">{html.escape(status)}</span>: {html.escape("; ".join(facts))}</p>'
+    )
+    items = "".join(f"<li>{html.escape(text)}</li>" for text in result.doubts)
+    return verdict + (f'\n<p>The data are doubtful:</p>\n<ul class="warnings">{items}</ul>' if items else "")
 
 
 def _shape(view: View, result: Result, truth: np.ndarray | None) -> str:

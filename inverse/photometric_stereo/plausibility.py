@@ -1,0 +1,86 @@
+"""Are the data what their files say? What would make a result wrong without a word, told from the values alone."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from . import axes, black_level, files, least_squares, lights_order, start
+from .axes import Axes
+from .black_level import BlackLevel
+from .dataset import LUMINANCE, Dataset
+from .lights_order import Order
+from .rendering import unlit
+
+log = logging.getLogger(__name__)
+
+#: Pixels from which this is judged, at most and at least.
+PIXELS, FEWEST = 5000, 100
+
+#: Images whose mean is less than this part of the median one are taken to be without light.
+DIM = 0.1
+
+
+@dataclass(frozen=True)
+class Plausibility:
+    """file : of the lights."""
+
+    file: str = files.DIRECTIONS
+    order: Order = field(default_factory=Order)
+    axes: Axes = field(default_factory=Axes)
+    black_level: BlackLevel = field(default_factory=BlackLevel)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """What, and how much."""
+        return [
+            ("order of the lights", str(self.order)),
+            ("axes of the lights", str(self.axes)),
+            ("black level", str(self.black_level)),
+        ]
+
+    def said(self) -> list[str]:
+        """Warnings, with what to do, in sentences. Of lights in another order, axes tell nothing."""
+        of_axes = [] if self.order.wrong else self.axes.said(self.file)
+        return [*self.order.said(self.file), *of_axes, *self.black_level.said()]
+
+
+def judged(data: Dataset) -> Plausibility:
+    """Of a data set. What it takes grows with its values: see `block`."""
+    file = files.LEDS if data.near else files.DIRECTIONS
+    shown, means = ~unlit(data), data.luminance.mean(0)
+    lit = np.flatnonzero(means > DIM * np.median(means))
+    if shown.sum() < FEWEST or len(lit) < 3:
+        return Plausibility(file)
+    mask = data.mask.copy()
+    mask[mask] = shown
+    data = replace(data, values=data.values[shown], mask=mask, truth=None)
+    plane = start.flat(data)
+    (directions, irradiance), lights = plane.lighting(), plane.mean_directions()
+    if lights[:, 2].max() <= 0 or np.linalg.matrix_rank(lights[lit], tol=least_squares.PLANE * len(lights)) < 3:
+        return Plausibility(file)
+    values = least_squares.as_at_infinity(data.luminance, irradiance)
+    found = least_squares.trimmed(values[:, lit].astype(np.float64), directions[..., lit, :])
+    pictured = (data.values * data.intensities.astype(np.float32)) @ LUMINANCE
+    names = data.names or [f"image {k + 1}" for k in range(len(lights))]
+    return Plausibility(
+        file,
+        lights_order.judged(values, lights, names, lit),
+        axes.judged(data, least_squares.facing(found)) if len(lit) >= axes.FEWEST else Axes(),
+        black_level.judged(pictured[:, lit], black_level.away(found, directions[..., lit, :])),
+    )
+
+
+def check(data: Dataset) -> tuple[str, ...]:
+    """Log what is doubtful about a data set of any size, and return it."""
+    step = block(len(data.values))
+    said = judged(data.at(1 / step)).said() if data.blocks(step)[0].any() else []
+    for text in said:
+        log.warning("ps: %s", text)
+    return tuple(said)
+
+
+def block(pixels: int) -> int:
+    """How wide blocks of pixels must be, so that at most about `PIXELS` are left of so many."""
+    return max(int(np.ceil(np.sqrt(pixels / PIXELS))), 1)
