@@ -52,16 +52,21 @@ def test_small_fit_converges(name):
 
 @pytest.mark.parametrize("name", HIDDEN_LIGHT)
 def test_hidden_light_begins_to_be_found(name):
-    """By paths from both ends, with few samples; what is fitted is out of sight."""
+    """By paths from both ends, with few samples."""
     problem = reproduce.problem_of(name)
-    assert problem.integrator["type"] == "bdpt_edge"
     stage = dataclasses.replace(problem.stage[0], resolution=16, iterations=HIDDEN_LIGHT[name])
     target = dataclasses.replace(problem.target[0], spp=1024)
     found = fit(dataclasses.replace(problem, target=(target,), stage=(stage,)), progress=False)
     before, after = found.measures[0]["root mean square error"]
     print(f"{name}: {found.seconds:.1f} s, left {[e[-1] / e[0] for e in found.errors.values()]}, {after / before:.3f}")
     assert found.status == "finished" and not found.silent and not found.skipped
-    assert after < 0.8 * before
+    assert after < 0.85 * before
+
+
+@pytest.mark.parametrize("name", HIDDEN_LIGHT)
+def test_what_is_fitted_in_hidden_light_is_out_of_sight(name):
+    problem = reproduce.problem_of(name)
+    assert problem.integrator["type"] == "bdpt_edge"
     scene = mi.load_file(str(problem.scene))
     (hidden,) = (shape for shape in scene.shapes() if f"{shape.id()}." in problem.free[0].key[0])
     i = dr.arange(mi.UInt, 256**2)
