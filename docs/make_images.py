@@ -1,8 +1,8 @@
 """Make the pictures of the README and the documentation:  python docs/make_images.py [FOLDER]
 
 About twelve minutes on two cores. Writes docs/images/without.webp, an animation; overview.png; normal_integration.png,
-which needs the depth of the bear of DiLiGenT in ../shared; jumps.png; adversarial.png, which needs the extra
-`adversarial`; and reflectance.png, if the argument names a folder with tables of the MERL database.
+which needs the depth of the bear of DiLiGenT in ../shared; jumps.png and hidden_light.png; adversarial.png, which needs
+the extra `adversarial`; and reflectance.png, if the argument names a folder with tables of the MERL database.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 # isort: off
@@ -196,13 +197,13 @@ def adversarial(path: Path) -> None:
     figure.savefig(path)
 
 
-def jumps(path: Path) -> None:
-    """Target, start and result of the three fits of `rimlight reproduce jumps`."""
+def fits(path: Path, names: Sequence[str]) -> None:
+    """Target, start and result of fits of `rimlight reproduce`."""
     from rimlight import inverse
     from rimlight.inverse import reproduce
 
     views = {}
-    for name in reproduce.FIGURES["jumps"]:
+    for name in names:
         with tempfile.TemporaryDirectory() as folder:
             (view,) = inverse.fit(reproduce.problem_of(name, Path(folder))).views
         views[name] = {"target": view.target, "start": view.start, "result": view.result}
@@ -233,7 +234,8 @@ if __name__ == "__main__":
     without(IMAGES / "without.webp")
     overview(IMAGES / "overview.png")
     normal_integration(IMAGES / "normal_integration.png")
-    jumps(IMAGES / "jumps.png")
+    fits(IMAGES / "jumps.png", ("pot_in_mirror", "ball_of_glass", "box_in_sand"))
+    fits(IMAGES / "hidden_light.png", ("lampshade", "caustic"))
     adversarial(IMAGES / "adversarial.png")
     if len(sys.argv) > 1:
         reflectance(IMAGES / "reflectance.png", Path(sys.argv[1]))

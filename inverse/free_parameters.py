@@ -103,8 +103,8 @@ class RigidBody(Parameter):
         points = np.concatenate([_points(value) for value in initial.values()])
         #: (3,), world space.
         self.centre = points.mean(0)
-        #: Radius of the body; of a camera or light alone, 1.
-        self.size = float(np.linalg.norm(points - self.centre, axis=1).max()) if len(points) > 1 else 1.0
+        #: Radius of the body; of frames alone that are in one place, such as a camera, 1.
+        self.size = float(np.linalg.norm(points - self.centre, axis=1).max()) or 1.0
         self.move, self.turn = f"{name}.move", f"{name}.turn"
         self.truth = {self.move: np.zeros(3, np.float32), self.turn: np.zeros(3, np.float32)}
         start = _numbers(free.start, {6}, name, "6 numbers") if free.start else np.zeros(6)

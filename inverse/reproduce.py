@@ -1,4 +1,4 @@
-"""The fits of Li et al. 2018, section 5, and three of our own, one after the other: `rimlight reproduce`.
+"""The fits of Li et al. 2018, section 5, and five of our own, one after the other: `rimlight reproduce`.
 
 Each is a scene and a TOML file in `rimlight.scenes`. Results that are there already are not made again, so that an
 interrupted run goes on where it was.
@@ -48,12 +48,14 @@ EXPERIMENTS = {
     "pot_in_mirror": "Pose of a teapot that only a mirror shows",
     "ball_of_glass": "Place and index of refraction of a ball of glass",
     "box_in_sand": "Pose of a box that is sunk into sand",
+    "lampshade": "Place of a lamp inside of its shade, from the room that it lights",
+    "caustic": "Pose of a bent sheet of metal, from the light that it throws on a table",
 }
 
 FIGURES = {"fig6": tuple(name for name in EXPERIMENTS if name.startswith("fig6")), "all": tuple(EXPERIMENTS)}
 FIGURES["jumps"] = "pot_in_mirror", "ball_of_glass", "box_in_sand"
 
-#: A fit of figure 6, or of `jumps`, holds if all parameters are left with at most this part of their error at the
+#: A fit of figure 6, or of our own, holds if all parameters are left with at most this part of their error at the
 #: start, or if the error of its picture is at most so many times its noise.
 LEFT, NOISE = 0.01, 1.5
 

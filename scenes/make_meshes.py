@@ -1,8 +1,8 @@
-"""A teapot, and sand in dunes, for the fits `pot_in_mirror` and `box_in_sand`.
+"""A teapot, sand in dunes, and a bent sheet, for the fits `pot_in_mirror`, `box_in_sand` and `caustic`.
 
     python -m rimlight.scenes.make_meshes
 
-writes `meshes/teapot.ply` and `meshes/sand.ply`, which are part of the project.
+writes `meshes/teapot.ply`, `meshes/sand.ply` and `meshes/sheet.ply`, which are part of the project.
 """
 
 from __future__ import annotations
@@ -82,8 +82,18 @@ def sand(size: int = 32) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([x, y, z], 1), np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
 
 
+def sheet(size: int = 48) -> tuple[np.ndarray, np.ndarray]:
+    """Half of an elliptic ring, upright, with two bends."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, size + 1)
+    x, z = 0.5 * np.sin(angle), 0.4 * np.cos(angle) + 0.015 * np.sin(4 * angle)
+    points = np.concatenate([np.stack([x, np.full_like(x, y), z], 1) for y in (0.02, 0.3)])
+    a = np.arange(size)
+    b, c, d = a + 1, a + size + 1, a + size + 2
+    return points, np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+
+
 def write(folder: Path) -> None:
-    for name, (points, faces) in {"teapot": teapot(), "sand": sand()}.items():
+    for name, (points, faces) in {"teapot": teapot(), "sand": sand(), "sheet": sheet()}.items():
         mesh = mi.Mesh(name, len(points), len(faces))
         params = mi.traverse(mesh)
         params["vertex_positions"] = np.ascontiguousarray(points, np.float32).ravel()

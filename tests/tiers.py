@@ -230,6 +230,7 @@ test_prb_edge.py::test_terms_add_up[vertices-False]
 test_reflectance.py::test_dictionary_of_the_package
 test_reflectance.py::test_reduction_finds_the_lobes_of_the_tables
 test_reflectance.py::test_reduction_keeps_few_alphas_and_etas
+test_reproduce.py::test_hidden_light_begins_to_be_found
 test_reproduce.py::test_small_fit_converges[ball_of_glass]
 test_reproduce.py::test_small_fit_converges[fig6b]
 test_reproduce.py::test_small_fit_converges[fig6c]

@@ -41,6 +41,13 @@ def test_rigid_motion_is_a_rotation_about_its_centre(rotation):
     np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
 
 
+def test_bodies_in_one_place_have_the_size_of_one():
+    """A lamp in the middle of its bulb: their frames are no extended body."""
+    frame = mi.Transform4f().translate([1, 2, 3])
+    body = free_parameters.RigidBody("lamp", Free(key="lamp", kind="pose", rate=0.1), {"lamp": frame, "bulb": frame})
+    assert body.rates() == pytest.approx({"lamp.move": 0.1, "lamp.turn": 0.1})
+
+
 @pytest.mark.parametrize("rotation", ROTATIONS, ids=str)
 def test_gradient_of_rigid_motions(rotation):
     weights = np.random.default_rng(0).standard_normal((3, 4))

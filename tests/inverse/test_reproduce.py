@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -28,6 +29,9 @@ LEFT = {
     "ball_of_glass": (200, 0.7, 0.4),
 }
 
+#: Fits in light that is hard to find from the camera, and steps of a small one.
+HIDDEN_LIGHT = {"lampshade": 12, "caustic": 40}
+
 
 @pytest.mark.usefixtures("no_derivative_image")
 @pytest.mark.parametrize("name", LEFT)
@@ -44,6 +48,31 @@ def test_small_fit_converges(name):
     assert found.status == "finished" and not found.silent and not found.skipped
     assert left < most_left
     assert after < most_picture * before
+
+
+@pytest.mark.parametrize("name", HIDDEN_LIGHT)
+def test_hidden_light_begins_to_be_found(name):
+    """By paths from both ends, with few samples."""
+    problem = reproduce.problem_of(name)
+    stage = dataclasses.replace(problem.stage[0], resolution=16, iterations=HIDDEN_LIGHT[name])
+    target = dataclasses.replace(problem.target[0], spp=1024)
+    found = fit(dataclasses.replace(problem, target=(target,), stage=(stage,)), progress=False)
+    before, after = found.measures[0]["root mean square error"]
+    print(f"{name}: {found.seconds:.1f} s, left {[e[-1] / e[0] for e in found.errors.values()]}, {after / before:.3f}")
+    assert found.status == "finished" and not found.silent and not found.skipped
+    assert after < 0.85 * before
+
+
+@pytest.mark.parametrize("name", HIDDEN_LIGHT)
+def test_what_is_fitted_in_hidden_light_is_out_of_sight(name):
+    problem = reproduce.problem_of(name)
+    assert problem.integrator["type"] == "bdpt_edge"
+    scene = mi.load_file(str(problem.scene))
+    (hidden,) = (shape for shape in scene.shapes() if f"{shape.id()}." in problem.free[0].key[0])
+    i = dr.arange(mi.UInt, 256**2)
+    place = (mi.Point2f(i % 256, i // 256) + 0.5) / 256
+    ray, _ = scene.sensors()[0].sample_ray(0, 0.5, place, mi.Point2f(0.5))
+    assert dr.none(scene.ray_intersect_preliminary(ray).shape == mi.ShapePtr(hidden))
 
 
 def test_room_has_177_parameters(tmp_path):
