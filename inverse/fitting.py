@@ -18,7 +18,7 @@ from tqdm import tqdm
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.loading import InputError
 
-from . import balancing, batches, free_parameters, progress, sources
+from . import balancing, batches, free_parameters, judging, progress, sources
 from . import problem as problems
 from . import result as results
 from .conforming import functions
@@ -35,9 +35,6 @@ from .tensorboard import TensorBoard
 from .workers import Lost
 
 log = logging.getLogger(__name__)
-
-#: Standard errors by which the best loss must be better than the last one for the fit to go back to it.
-SURE = 4.0
 
 #: A stage goes on while its loss falls by this fraction within `patience` steps.
 FALL = 1e-3
@@ -341,11 +338,13 @@ class Fit:
             now.found = []
 
     def restore_best(self) -> None:
-        """Go back to the best state of the segment, if the noise of the loss does not explain that it was better."""
+        """Go back to the best state of the segment, if noise does not explain that it was better: not that of the loss,
+        nor that of the pictures, whose variance is a part of the loss."""
         now = self.progress
         if now.best:
             mean, error = self.recent()
-            if not mean <= now.best_loss + SURE * np.hypot(error, now.best_error):
+            better = not mean <= now.best_loss + judging.SURE * np.hypot(error, now.best_error)
+            if better and (not np.isfinite(now.losses[-1]) or judging.is_better(self, now.best)):
                 self.optimiser.restart(now.best)
 
     def recent(self) -> tuple[float, float]:
