@@ -341,7 +341,7 @@ class Fit:
         """Go back to the best state of the segment, if noise does not explain that it was better: not that of the loss,
         nor that of the pictures, whose variance is a part of the loss."""
         now = self.progress
-        if now.best:
+        if now.best and now.segment < len(self.plan):  # after the last step, it has been judged
             mean, error = self.recent()
             better = not mean <= now.best_loss + judging.SURE * np.hypot(error, now.best_error)
             if better and (not np.isfinite(now.losses[-1]) or judging.is_better(self, now.best)):

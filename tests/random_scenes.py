@@ -425,7 +425,7 @@ class Generator:
         material, bsdf = self.bsdf(uv, closed and kind != "torus")
         if not closed:
             bsdf = self.two_sided(bsdf) if bsdf["type"] not in ("roughdielectric", "thindielectric", "mask") else bsdf
-        lamp = (self.chance(0.15) and self.special != "cut") or material == "black"
+        lamp = (self.chance(0.15) and self.special not in ("cut", "mirrors")) or material == "black"
         emitter = self.emitter(0.5, 3) if lamp else None
         smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
         smooth &= not lamp or kind == "fine"  # what coarse lamps light is off by some per cent, with a warning

@@ -220,12 +220,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
 
 def has_its_inverse(shape: Any) -> bool:
     """Is the inverse that Mitsuba keeps of the transformation of a shape that of its matrix? (The vertices of a mesh
-    are transformed already.)"""
+    are transformed already. The place of a shape is left out, which rounding moves far from the origin.)"""
     if not isinstance(shape, mi.Shape) or shape.is_mesh():
         return True
     to_world = mi.traverse(shape)["to_world"]
-    product = np.array(to_world.matrix @ to_world.inverse().matrix, float).reshape(4, 4)
-    return bool(np.abs(product - np.eye(4)).max() < SHEARED)
+    linear, inverse = (np.array(m, float).reshape(4, 4)[:3, :3] for m in (to_world.matrix, to_world.inverse().matrix))
+    return bool(np.abs(linear @ inverse - np.eye(3)).max() < SHEARED)
 
 
 def is_mirror(shape: mi.Shape) -> bool:

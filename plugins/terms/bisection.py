@@ -67,7 +67,8 @@ class BisectionTerm(Term):
         count = sum(job.counts.on_line(part.sensor.film()) for part in job.parts) if self._wanted(job) else 0
         what = [w for w, there in zip(WHAT, (job.boundaries.mirrors, job.boundaries.textures), strict=True) if there]
         why_not = '"sppp" is 0' if what else "neither mirrors, glass, textures nor beams with jumps, or nothing moves"
-        return self.plan(count, RAYS + 2 * job.rays_of_path, " and ".join(what), why_not)
+        rays = RAYS if job.boundaries.shown is None else 2 * RAYS  # as many to lights
+        return self.plan(count, rays + 2 * job.rays_of_path, " and ".join(what), why_not)
 
     def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
         return [partial(self._samples, job, i, part) for i, part in enumerate(job.parts)] if self._wanted(job) else []

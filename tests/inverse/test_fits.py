@@ -183,6 +183,19 @@ def test_the_best_state_is_restored():
     np.testing.assert_array_equal(found.values[COLOUR], executor.seen[best])
 
 
+def test_a_fit_that_is_stopped_at_its_last_step_is_finished_but_for_its_status():
+    found = []
+    for stops in (False, True):
+        run = fitting.Fit(triangles(MATERIAL, steps=30))
+        executor = Valley({i: lambda loss, gradient: (loss, np.full(3, 1.0)) for i in range(16, 31)})
+        executor.here, run.executor = run.executor, executor
+        run.on_step(lambda step, run=run, stops=stops: run.stop() if stops and step.number == 29 else None)
+        found.append(run.run(progress=False))
+    assert [result.status for result in found] == ["finished", "stopped"]
+    assert all(len(result.losses) == 30 for result in found)
+    np.testing.assert_array_equal(*(result.values[COLOUR] for result in found))
+
+
 def test_noise_of_the_loss_does_not_choose_the_result():
     rng = np.random.default_rng(4)
     noisy = lambda loss, gradient: (loss + 1 + 0.1 * rng.standard_normal(), gradient)

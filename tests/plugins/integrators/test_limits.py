@@ -217,10 +217,10 @@ def test_suns_whose_outlines_are_seen(text, bsdf, key, warned):
 # ---------------------- Transformations ----------------------
 
 
-@pytest.mark.parametrize(("axis", "count"), [([1, 1, 0], 1), ([0, 1, 0], 0)])
-def test_axes_that_are_not_of_unit_length_are_warned_about(axis, count):
+@pytest.mark.parametrize(("axis", "size", "count"), [([1, 1, 0], 1, 1), ([0, 1, 0], 1, 0), ([0.6, 0.8, 0], 1e5, 0)])
+def test_axes_that_are_not_of_unit_length_are_warned_about(axis, size, count):
     """`rotate` shears then, and the inverse that Mitsuba keeps is another one."""
-    place = mi.ScalarTransform4f().translate([0, 0, 1]).rotate(axis, 20)
+    place = mi.ScalarTransform4f().translate([3 * size, size, size]).rotate(axis, 20).scale([size, 1e-2 * size, size])
     thing = {"type": "disk", "id": "thing", "to_world": place}
     messages = said(
         cases.scene(sensor=cases.camera((0, 0, -5), (0, 0, 0)), thing=thing, sky=cases.constant()), "sensor.to_world"
