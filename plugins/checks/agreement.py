@@ -173,6 +173,20 @@ def compare(derivatives: np.ndarray, reference: FiniteDifferences, *, tolerance:
     )
 
 
+def two_sides(before: FiniteDifferences, after: FiniteDifferences) -> tuple[float, float]:
+    """By how much differences to both sides are apart: sum of absolute values, relative to that of their mean; and what
+    noise alone would make of it, at most.
+
+    before, after : `finite_differences` with the sides -1 and 1. If they are apart, however small the step is, the
+        image has no derivative: it depends on the side.
+    """
+    size = float(np.abs(before.mean + after.mean).sum() / 2)
+    apart = float(np.abs(after.mean - before.mean).sum())
+    # Of a normal distribution, the mean of absolute values is √(2/π) standard deviations.
+    noise = float(np.sqrt(2 / np.pi) * (before.standard_error + after.standard_error).sum())
+    return (apart / size, noise / size) if size else (0.0, 0.0)
+
+
 def _limit(count: int, freedom: int) -> float:
     """What the largest of `count` values of |t| exceeds with a probability of `CHANCE` (Šidák)."""
     return float(stats.t.isf((1 - (1 - CHANCE) ** (1 / count)) / 2, freedom))

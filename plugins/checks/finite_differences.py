@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -64,6 +64,7 @@ def finite_differences(
     integrator: mi.Integrator | None = None,
     sensor: int = 0,
     seed: int = 0,
+    side: Literal[-1, 0, 1] = 0,
     progress: bool = False,
 ) -> FiniteDifferences:
     """Central differences (I(+h) − I(−h)) / 2h over independent runs, for a step and for half of it.
@@ -78,6 +79,9 @@ def finite_differences(
     runs : number of independent runs, at least 2; their spread gives the standard error.
     spp : samples per pixel of each image, a square number is best.
     max_depth : of `path`, unless another `integrator` is given.
+    side : 1 or -1 stands for differences to that side alone, (I(+h) − I(0)) / h or (I(0) − I(−h)) / h. If both differ
+        however small h is, the image has no derivative: two surfaces begin to part, say. Then central differences are
+        the mean of both.
 
     Raises
     ------
@@ -92,11 +96,14 @@ def finite_differences(
     differences = []
     try:
         for i in tqdm(range(runs), desc="finite differences", disable=not progress):
-            images = []
-            for theta in (step, -step, step / 2, -step / 2):
-                motion.apply(theta)
-                images.append(render_stratified(scene, integrator, camera, seed + i, spp))
-            differences.append([(images[0] - images[1]) / (2 * step), (images[2] - images[3]) / step])
+            run = []
+            for h in (step, step / 2):
+                ends, images = (min(side + 1, 1) * h, max(side - 1, -1) * h), []
+                for theta in ends:
+                    motion.apply(theta)
+                    images.append(render_stratified(scene, integrator, camera, seed + i, spp))
+                run.append((images[0] - images[1]) / (ends[0] - ends[1]))
+            differences.append(run)
     finally:
         motion.apply(0.0)
     whole, half = np.mean(differences, axis=0)
@@ -105,6 +112,7 @@ def finite_differences(
         "motion": str(motion),
         "unit": motion.unit,
         "step": step,
+        "side": side,
         "runs": runs,
         "spp": spp,
         "seed": seed,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +16,7 @@ from tyro.conf import UseAppendAction, arg
 import rimlight
 from rimlight import pictures
 from rimlight._image_advice import image_advice
-from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image
+from rimlight.checks import Agreement, FiniteDifferences, Motion, compare, derivative_image, two_sides
 from rimlight.edge_sampling.geometry.meshes import is_positions_key
 from rimlight.exr import write_exr
 from rimlight.loading import InputError, load_integrator, use_variant
@@ -190,9 +191,15 @@ class FiniteDifferencesCommand(OnMotion):
         return 0
 
 
+#: How far apart one-sided differences may be, relative to central ones, where an image has a derivative: edges enter
+#: and leave pixels within a step.
+BENDS = 0.25
+
+
 @dataclass(frozen=True, kw_only=True)
 class Check(OnMotion):
-    """Compare a derivative with finite differences. The exit code is 1 if they disagree by more than their noise."""
+    """Compare a derivative with finite differences. The exit code is 1 if they disagree by more than their noise. Then,
+    differences to each side alone tell whether the image has a derivative at all."""
 
     step: float
     """Step h of the finite differences. Choose it such that the image moves by a few hundredths of a pixel."""
@@ -231,9 +238,10 @@ class Check(OnMotion):
         derivatives = self._derivatives(scene, integrator, motion)
         seconds = [time.perf_counter() - start]
         start = time.perf_counter()
-        reference = self.reference(
-            scene, motion, step=self.step, runs=self.runs, spp=self.fd_spp, max_depth=self.max_depth
+        differences = partial(
+            self.reference, scene, motion, step=self.step, runs=self.runs, spp=self.fd_spp, max_depth=self.max_depth
         )
+        reference = differences()
         seconds.append(time.perf_counter() - start)
 
         agreement = compare(derivatives, reference, tolerance=self.tolerance)
@@ -246,6 +254,8 @@ class Check(OnMotion):
         for name, value in agreement.numbers().items():
             print(f"{name:<19} {value}")
         print("result              " + (f"DISAGREE: {'; '.join(faults)}" if faults else "agree, within their noise"))
+        if faults:
+            self._look_at_both_sides(differences, derivatives)
         if self.out:
             _loading.make_folder(self.out.parent)
             with writing():
@@ -264,6 +274,21 @@ class Check(OnMotion):
                 )
                 renders.append(accumulate(render, launches, "launch"))
         return np.array(renders)
+
+    def _look_at_both_sides(self, differences: Callable[..., FiniteDifferences], derivatives: np.ndarray) -> None:
+        """Say whether the image has a derivative at all."""
+        before, after = (differences(side=side) for side in (-1, 1))
+        apart, noise = two_sides(before, after)
+        print(f"both sides          differences before and after differ by {apart:.2%} (of noise: {noise:.2%})")
+        if apart > BENDS + 2 * noise:
+            sides = {"those before": before, "those after": after}
+            agrees = [
+                n for n, side in sides.items() if not compare(derivatives, side, tolerance=self.tolerance).faults()
+            ]
+            print(
+                f"{'':<20}The image has no derivative here, or the step is too large: surfaces may begin to touch or "
+                f"to part. The derivative agrees with {' and '.join(agrees) or 'neither'}."
+            )
 
     def _write_panels(
         self, what: str, unit: str, derivative: np.ndarray, reference: FiniteDifferences, result: Agreement

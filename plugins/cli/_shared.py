@@ -102,7 +102,15 @@ class OnMotion(OnSensor):
         )
 
     def reference(
-        self, scene: Any, motion: Motion, *, step: float, runs: int, spp: int, max_depth: int
+        self,
+        scene: Any,
+        motion: Motion,
+        *,
+        step: float,
+        runs: int,
+        spp: int,
+        max_depth: int,
+        side: Literal[-1, 0, 1] = 0,
     ) -> FiniteDifferences:
         most = MAX_REFERENCE_SAMPLES // self.pixels(scene)
         if spp > most:
@@ -118,6 +126,7 @@ class OnMotion(OnSensor):
             max_depth=max_depth,
             sensor=self.sensor,
             seed=self.seed,
+            side=side,
             progress=sys.stderr.isatty(),
         )
 

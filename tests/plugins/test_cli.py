@@ -297,7 +297,11 @@ def test_check_tells_right_from_wrong(capsys, tmp_path):
     assert mi.Bitmap(str(picture)).size().x > 500
     # Mitsuba's `direct` does not know the boundary
     assert main([*options, "--seeds", "4", "--integrator", "direct"]) == 1
-    assert "DISAGREE" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "DISAGREE" in out
+    # But the image has a derivative.
+    assert "differences before and after differ by" in out
+    assert "no derivative" not in out
 
 
 def test_interruption_leaves_nothing(capfd, tmp_path, monkeypatch):
