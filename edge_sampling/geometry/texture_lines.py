@@ -27,6 +27,7 @@ from .meshes import (
     is_met,
     objects_below,
     pointer,
+    surfaces,
     texture_coordinates,
 )
 
@@ -205,14 +206,18 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
 
     besides : shapes whose textures are not asked for, but for volumes, whose jumps are not known as lines.
     """
-    known = [o for s in besides for o in objects_below(s).values() if o.class_name() != VOLUME]
+    below = lambda owners: {id(o): o for owner in owners for o in objects_below(owner).values()}
+    # A scene file may define materials, or wrap them, that no shape refers to.
+    used = below((*surfaces(scene), *scene.emitters()))
+    known = [k for k, o in below(besides).items() if o.class_name() != VOLUME]
     box = scene.bbox()
     uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if has_texcoords(m)]
     uv = np.concatenate([[[0, 0], [1, 1]], *uv])
     return [
         f'"{name}" ({o.class_name().partition("TextureImpl")[0]})'
         for name, o in objects_below(scene).items()
-        if not any(o is k for k in known)
+        if id(o) in used
+        and id(o) not in known
         and (
             (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
             or (has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))

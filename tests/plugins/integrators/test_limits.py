@@ -227,3 +227,25 @@ def test_axes_that_are_not_of_unit_length_are_warned_about(axis, size, count):
     )
     assert len(messages) == count
     assert all('wrong for "thing"' in m for m in messages)
+
+
+# ---------------------- Materials without a surface ----------------------
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_bump_map_that_no_surface_has_is_not_warned_about(wrapped):
+    """Files of exporters name what is inside of a bump map, and let their shapes refer to that."""
+    paint = '<bsdf type="diffuse" id="paint"/>'
+    checks = '<texture type="checkerboard"/>'
+    scene = mi.load_string(
+        f"""
+        <scene version="3.0.0">
+            <bsdf type="bumpmap" id="rough">{checks}{paint}</bsdf>
+            <shape type="rectangle" id="floor"><ref id="{"rough" if wrapped else "paint"}"/></shape>
+            <emitter type="constant"/>
+            <sensor type="perspective"/>
+        </scene>
+        """
+    )
+    assert bool(texture_lines.jumping_textures(scene)) == wrapped
+    assert not said(scene, "floor.to_world")
