@@ -34,7 +34,7 @@ def scene(source: Any, define: Mapping[str, str]) -> mi.Scene:
     who = Path("in memory")
     if isinstance(source, dict):
         with expected(RuntimeError, who=f'scene "{who}"'):
-            source = mi.load_dict(source)
+            source = mi.load_dict(source, optimize=False)  # what is equal at the start must not become one
     if not isinstance(source, mi.Scene):
         raise InputError(f"fit: a scene is a path, a dictionary or an mi.Scene, got {type(source).__name__}")
     check_scene(source, who)

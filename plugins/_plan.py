@@ -118,4 +118,4 @@ def plan(
 
 def names(shapes: Iterable[Any]) -> tuple[str, ...]:
     """Names of shapes, for messages."""
-    return tuple(f'"{s.id()}"' for s in shapes)
+    return tuple(f'"{s.id()}"' if s.id() else f"a {s.class_name()} without an id" for s in shapes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -64,7 +65,14 @@ def use_variant(name: str) -> None:
 
 
 def load_scene(path: Path, definitions: Sequence[str] = ()) -> Any:
-    """Load and check a scene. definitions : ``key=value``, parameters of the scene file."""
+    """Load and check a scene, as its file has it.
+
+    By itself, Mitsuba makes one mesh of all that have equal materials, and one material of equal ones: then a chair
+    cannot move alone, and walls that start with the same colour keep the same colour. Here, nothing is merged; and
+    what has no identifier gets one, see `name_objects`.
+
+    definitions : ``key=value``, parameters of the scene file.
+    """
     values = {}
     for definition in definitions:
         key, equals, value = definition.partition("=")
@@ -74,11 +82,28 @@ def load_scene(path: Path, definitions: Sequence[str] = ()) -> Any:
     if not path.is_file():
         raise InputError(f'scene "{path}" does not exist' if not path.exists() else f'scene "{path}" is not a file')
     with expected(RuntimeError, who=f'scene "{path}"'):
-        scene = mi.load_file(str(path), **values)
+        scene = mi.load_file(str(path), optimize=False, **values)
     if not isinstance(scene, mi.Scene):
         raise InputError(f'"{path}" holds no scene, but a {type(scene).__name__}')
+    name_objects(scene)
     check_scene(scene, path)
     return scene
+
+
+def name_objects(scene: Any) -> None:
+    """Name the shapes, lights and sensors of a scene that have no identifier: by their class, and a number if there are
+    several, in the order of the file: ``PerspectiveCamera``, ``Rectangle``, ``Rectangle_1``.
+
+    Mitsuba 3.9 lists the parameters of such objects by their address in memory, which is another one in each run.
+    """
+    objects = [*scene.sensors(), *scene.shapes(), *scene.emitters()]
+    taken = {o.id() for o in objects}
+    for o in objects:
+        if not o.id():
+            name = o.class_name()
+            names = itertools.chain([name], (f"{name}_{k}" for k in itertools.count(1)))
+            o.set_id(next(n for n in names if n not in taken))
+            taken.add(o.id())
 
 
 def check_scene(scene: Any, path: Path) -> None:

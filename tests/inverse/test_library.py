@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rimlight import inverse, scenes
-from rimlight.inverse import losses, optimisers
+from rimlight.inverse import losses, optimisers, sources
 from rimlight.inverse import problem as problems
 from rimlight.inverse.problem import Free, Loss, Problem, Stage, Target
 
@@ -407,3 +407,12 @@ def test_results_in_notebooks():
     html = inverse.fit(posed(stage=Stage(iterations=1)), progress=False)._repr_html_()
     assert "finished" in html and html.count("<img") == 3 and html.count("data:image/png") == 3
     assert "<html" not in html and "<script" not in html
+
+
+def test_what_is_equal_at_the_start_stays_apart():
+    """Mitsuba would make one mesh of both, and lose their names."""
+    cube = {"type": "cube", "bsdf": {"type": "diffuse"}}
+    sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}
+    scene = {"type": "scene", "sensor": sensor, "sky": {"type": "constant"}, "a": cube, "b": cube}
+    found = sources.scene(scene, {})
+    assert {"a.vertex_positions", "b.vertex_positions"} <= set(mi.traverse(found).keys())

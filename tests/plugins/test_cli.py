@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from rimlight import scenes
 from rimlight.checks import FiniteDifferences, derivative_image
 from rimlight.cli import main
 from rimlight.exr import read_exr
-from rimlight.loading import InputError, check_scene
+from rimlight.loading import InputError, check_scene, load_scene
 
 TRIANGLES = str(scenes.path("two_triangles"))
 SMALL = ["-D", "res=16"]
@@ -217,6 +218,41 @@ def test_params(capsys):
     assert rows["camera.to_world"].endswith("∂, D")
     assert rows["green.bsdf.reflectance.value"].endswith("∂")
     assert "green.faces" not in rows
+
+
+#: As exporters write scenes: cameras and lights have no identifier, and materials are equal.
+UNNAMED = """
+<scene version="3.0.0">
+    <bsdf type="diffuse" id="wall"/>
+    <bsdf type="diffuse" id="floor"/>
+    <shape type="cube"><ref id="floor"/></shape>
+    <shape type="cube"><transform name="to_world"><translate x="4"/></transform><ref id="wall"/></shape>
+    <shape type="cube" id="Cube_1"><transform name="to_world"><translate x="8"/></transform><ref id="wall"/></shape>
+    <emitter type="point"/>
+    <sensor type="perspective"/>
+</scene>
+"""
+
+
+def test_files_without_names(capsys, tmp_path):
+    """What a file has is there, nothing merged, with the same names in each run."""
+    (tmp_path / "scene.xml").write_text(UNNAMED)
+    scene = load_scene(tmp_path / "scene.xml")
+    assert [s.id() for s in scene.shapes()] == ["Cube", "Cube_2", "Cube_1"]
+    assert [float(s.bbox().center().x) for s in scene.shapes()] == [0, 4, 8]
+    assert main(["params", str(tmp_path / "scene.xml")]) == 0
+    out = capsys.readouterr().out
+    for key in (
+        "Cube.vertex_positions",
+        "Cube_2.vertex_positions",
+        "Cube_1.vertex_positions",
+        "PerspectiveCamera.to_world",
+        "PointLight.intensity.value",
+        "wall.reflectance.value",
+        "floor.reflectance.value",
+    ):
+        assert re.search(rf"^{re.escape(key)} ", out, re.MULTILINE), key
+    assert "object_" not in out
 
 
 def test_render_to_a_folder_and_to_a_file(tmp_path):
