@@ -140,8 +140,9 @@ def advice(
     ValueError : a key is unknown, or cannot be differentiated.
     RuntimeError : no integrator has this derivative, or it is 0 for all.
     """
-    kinds = [{"type": kind, "max_depth": max_depth} for kind in ("prb_edge", "bdpt_edge")]
-    pilots, refused = [], []
+    kinds: list[dict[str, Any]] = [{"type": kind, "max_depth": max_depth} for kind in ("prb_edge", "bdpt_edge")]
+    pilots: list[Pilot] = []
+    refused: list[Row] = []
     for kind in ([{"type": "direct_edge"}] if direct else []) + kinds:
         try:
             pilots.append(_pilot(scene, keys, kind, sensor, seed))
