@@ -44,7 +44,8 @@ class Pilot:
     """Gradients by one integrator.
 
     gradients : of each parameter, (PATTERNS, RUNS, n): with respect to its latent numbers, those of a rigid body as
-        displacements of its outermost point. seconds : of the kernels, for one gradient.
+        displacements of its outermost point. seconds : of the kernels, for one gradient: the least of
+        all, since others may have waited for other work.
     """
 
     integrator: str
@@ -176,7 +177,7 @@ def compared(keys: tuple[str, ...], pilots: Sequence[Pilot], refused: Sequence[R
         sure &= pilot is best or bool(lacks[pilot.integrator]) or low > 1
     rows.sort(key=lambda row: (row.integrator != best.integrator, bool(row.lacks), row.effort))
     seeing = {row.integrator for row in rows}
-    blind = [_without_numbers(kind, why) for kind, why in lacks.items() if kind not in seeing]
+    blind = [_without_numbers(kind, why or "its derivative is 0") for kind, why in lacks.items() if kind not in seeing]
     return Advice(keys, (*rows, *blind, *refused), sure)
 
 
@@ -186,13 +187,15 @@ def _without_numbers(integrator: str, why: str) -> Row:
 
 def _lacks(pilot: Pilot, pilots: Sequence[Pilot]) -> str:
     """What an integrator has missed, in words; or nothing."""
+    # As if one number, of one picture, made all of the noise: which may be so.
+    limit = stats.f.isf(CHANCE, 1, RUNS - 1)
     for other in pilots:
         for a, b in zip(pilot.gradients, other.gradients, strict=True):
             means, variances = [g.mean(1) for g in (a, b)], [g.var(1, ddof=1) / RUNS for g in (a, b)]
             noise = (variances[0] + variances[1]).sum()
             lengths = [float((m**2 - v).sum()) for m, v in zip(means, variances, strict=True)]
             ratio = ((means[0] - means[1]) ** 2).sum() / noise if noise else 0
-            if ratio > stats.f.isf(CHANCE, PATTERNS, PATTERNS * (RUNS - 1)) and lengths[0] < lengths[1]:
+            if ratio > limit and lengths[0] < lengths[1]:
                 far = f"its mean differs from that of {other.integrator} by {np.sqrt(ratio):.1f} times their noise"
                 return f"{far}, so it misses light"
     return ""
@@ -226,7 +229,7 @@ def _pilot(scene: mi.Scene, keys: Sequence[str], kind: dict[str, Any], sensor: i
         view.resize(None)
         view.loaded.reset()
     by_pattern = lambda g: np.array(g).reshape(RUNS, PATTERNS, -1).swapaxes(0, 1)
-    return Pilot(kind["type"], tuple(map(by_pattern, zip(*found[2:], strict=True))), float(np.median(seconds[2:])))
+    return Pilot(kind["type"], tuple(map(by_pattern, zip(*found[2:], strict=True))), min(seconds[2:]))
 
 
 def random_picture(shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:

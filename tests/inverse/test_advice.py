@@ -66,7 +66,7 @@ def test_equal_means_are_not_taken_for_different():
 def test_no_light_at_all_is_not_advised():
     dark = Pilot("dark", (np.zeros(SHAPE),), 1.0)
     found = compared(("a",), [dark, pilot("lit", 1.0)])
-    assert found.integrator == "lit" and "misses light" in str(found.rows[1])
+    assert found.integrator == "lit" and "its derivative is 0" in str(found.rows[1])
     with pytest.raises(RuntimeError, match="derivatives to be measured are zero"):
         compared(("a",), [dark])
 
@@ -101,7 +101,7 @@ def test_measured(variant):
     found = advice(scene, [key], max_depth=2, direct=True)
     assert {row.integrator for row in found.rows} == {"direct_edge", "prb_edge", "bdpt_edge"}
     assert not any(row.lacks for row in found.rows)
-    assert found.integrator != "bdpt_edge"
+    assert all(row.seconds > 0 and np.isfinite(row.effort) for row in found.rows)
     assert np.array_equal(np.array(mi.traverse(scene)[key]), before)
     assert list(scene.sensors()[0].film().size()) == size
 
