@@ -44,15 +44,18 @@ class ImageAdvice:
             return "bdpt_edge"
         return "direct_edge" if self.indirect <= FEW else "prb_edge"
 
-    def __str__(self) -> str:
+    @property
+    def images(self) -> str:
+        """What to say of images."""
         if self.integrator == "bdpt":
             found = f"{100 * self.share:.0f} % of the light that the sensor sees is found from the lights"
-            return (
-                f"images: bdpt, since {found}, and hardly from the camera\nderivatives: bdpt_edge, for the same reason"
-            )
-        images = "images: path or prb_edge, since light samples from the camera find what bdpt would find, in less time"
+            return f"images: bdpt, since {found}, and hardly from the camera"
+        return "images: path or prb_edge, since light samples from the camera find what bdpt would find, in less time"
+
+    def __str__(self) -> str:
         part = f"{100 * self.indirect:.1f} % of the light that the sensor sees is reflected more than once"
-        return f"{images}\nderivatives: {self.derivative}, since {part}"
+        why = "for the same reason" if self.integrator == "bdpt" else f"since {part}"
+        return f"{self.images}\nderivatives: {self.derivative}, {why}"
 
 
 def image_advice(scene: mi.Scene, *, sensor: int = 0, max_depth: int = 6) -> ImageAdvice:
@@ -61,7 +64,7 @@ def image_advice(scene: mi.Scene, *, sensor: int = 0, max_depth: int = 6) -> Ima
 
     It renders a small image by `bdpt`, and looks at which part of it those ways make that start at the camera, and
     which part is reflected more than once: a few seconds, most of them compilation. It looks at the image alone. What
-    changes is not known to it, so a derivative may have other noise: `balance` measures that of one motion.
+    changes is not known to it, so a derivative may have other noise: `rimlight.inverse.advice` measures that.
 
     max_depth : of the paths, in segments; -1 stands for no limit.
 

@@ -63,7 +63,8 @@ class PlanCommand(OnSensor):
     spp: int = 16
     """Samples per pixel."""
     images: bool = False
-    """Say also which integrator suits images of the scene, and which its derivatives. Takes some seconds."""
+    """Say also which integrator suits images of the scene, and which its derivatives. With --param, the noise of these
+    derivatives is measured. Takes some seconds for the image, and up to a minute for derivatives."""
 
     def run(self) -> int:
         at_least(1, spp=self.spp)
@@ -78,9 +79,29 @@ class PlanCommand(OnSensor):
         ]
         print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
         if self.images:
-            longest = integrator.depths.max_depth
-            print(image_advice(scene, sensor=self.sensor, max_depth=longest if longest < 0xFFFFFFFF else -1))
+            self._advise(scene, integrator.depths.max_depth)
         return 0
+
+    def _advise(self, scene: Any, longest: int) -> None:
+        """Print which integrators suit. longest : path, in segments."""
+        max_depth = longest if longest < 0xFFFFFFFF else -1
+        seen = image_advice(scene, sensor=self.sensor, max_depth=max_depth)
+        if not self.param:
+            print(seen)
+            return
+        from rimlight.inverse.advice import advice  # only now, since it imports much
+
+        print(seen.images)
+        print(
+            advice(
+                scene,
+                self.param,
+                sensor=self.sensor,
+                max_depth=max_depth,
+                direct=seen.derivative == "direct_edge",
+                seed=self.seed,
+            )
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -92,6 +92,7 @@ def lasting_limits(
     limits = []
     if sppi:
         limits += reflected_light(scene, geometry, depths, from_points=from_points)
+        limits += shut_in_lamps(scene, moving) if depths.scatters(2) else []
         if depths.scatters(1):
             limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
@@ -136,6 +137,20 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             "light: their silhouettes are unknown. Replace them by meshes."
         )
     return limits
+
+
+def shut_in_lamps(scene: mi.Scene, moving: Moving) -> list[str]:
+    """What lacks of the motion of lamps in bulbs of smooth glass: light samples do not go through the glass, and what
+    it shows slides over a lamp, so that the whole derivative is at the outlines behind it."""
+    lamps = [s for s in moving.shapes if s.is_emitter()]
+    lets_light_through = mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission
+    bulbs = [s for s in surfaces(scene) if s.bsdf() is not None and s.bsdf().flags() & lets_light_through]
+    shut_in = [(lamp, bulb) for bulb in bulbs for lamp in lamps if lamp != bulb and bulb.bbox().contains(lamp.bbox())]
+    return [
+        f"with respect to the place of {names([lamp])[0]}, the derivative lacks all that its light does behind the "
+        f"smooth glass of {names([bulb])[0]}, in which it is: it may be 0. Give the glass a roughness, or leave it out."
+        for lamp, bulb in shut_in
+    ]
 
 
 def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool) -> list[str]:
