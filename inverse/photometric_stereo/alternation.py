@@ -18,18 +18,18 @@ from .direct import DirectModel, Guess, Lighting
 from .evidence import FAR, Judge, Kind
 from .rendering import Rendering
 
-#: Share of the newest interreflections in their running mean.
-AVERAGED = 0.25
-
 #: Paths of each image of interreflections, at least: small images have more samples per pixel than `spp`, and are
 #: smoothed less, at equal noise. Smoothing takes away what a fold reflects of the one beside it.
-PATHS = 2**16
+PATHS = 2**18
 
 #: Exposures that seem to be off by less (logarithm) are taken as stated: shapes and BSDFs explain so much as well.
 STATED = 0.02
 
 #: Fits of the BSDF and of normals in turns, in each alternation: rendering takes longer.
 INNER = 3
+
+#: Steps of pixels that begin again from the normals of the surface.
+AGAIN = 6
 
 #: By which part the product of `left_out` and `halves` must be less for another kind of material: one that may be more
 #: also makes up a little for what has nothing to do with it, such as lights that are not at infinity. Set with the bear
@@ -61,11 +61,8 @@ class State:
     start: bool = False
 
     def better_than(self, other: State | None) -> bool:
-        """Where nothing can be left out, what is newer is. Under a coat, it must predict better by more than its
-        standard error: there, normals may drift along what predictions hardly tell."""
-        if other is None:
-            return True
-        return not self.left_out >= other.left_out - (self.uncertain if self.kind.coat else 0)
+        """Are predictions and halves together better? Where nothing can be left out, what is newer is."""
+        return other is None or not self.part_of(other) >= 1
 
     def beats(self, start: State) -> bool:
         """Does it predict better than the start, do its normals depend less on which lights tell them, and are they
@@ -76,9 +73,13 @@ class State:
     def needed_beside(self, simpler: State) -> bool:
         """Does it predict better by more than the standard error of what is simpler (the rule of one standard error,
         Breiman et al. 1984, section 3.4.3), and are predictions and halves together better by `GAIN`?"""
-        known = np.isfinite([self.halves, simpler.halves]).all()
-        gain = 1 - self.left_out / simpler.left_out * (self.halves / simpler.halves if known else 1)
-        return self.left_out < simpler.left_out - simpler.uncertain and gain > GAIN
+        return self.left_out < simpler.left_out - simpler.uncertain and self.part_of(simpler) < 1 - GAIN
+
+    def part_of(self, other: State) -> float:
+        """The product of `left_out` and `halves` over that of the other one; of `left_out` alone if halves are not
+        known."""
+        known = np.isfinite([self.halves, other.halves]).all() and other.halves > 0
+        return self.left_out / other.left_out * (self.halves / other.halves if known else 1)
 
 
 @dataclass
@@ -87,7 +88,7 @@ class Course:
 
     state : the newest one. most : alternations after which they end. best : of the states that were judged; None before
     the first one was. number : of alternations that were made. worse : how many in a row were worse than the best.
-    indirect : running mean of the interreflections, (P, K, 3), or None.
+    indirect : interreflections of the newest state, (P, K, 3), or None.
     """
 
     state: State
@@ -110,10 +111,11 @@ class Course:
 
 @dataclass
 class View:
-    """What a state shows: points, (P, 3); which lights its surface does not hide, (P, K); and what it reflects on
-    itself, (P, K, 3), or None."""
+    """What a state shows: points, (P, 3), and normals, (P, 3), of its depth; which lights its surface does not hide,
+    (P, K); and what it reflects on itself, (P, K, 3), or None."""
 
     points: np.ndarray
+    normals: np.ndarray
     seen: np.ndarray
     indirect: np.ndarray | None
 
@@ -148,9 +150,8 @@ class Alternations:
     def integrate(self, guess: Guess) -> np.ndarray:
         return self.domain.integrate(guess.normals, self.options.bilateral)
 
-    def view(self, guess: Guess, depth: np.ndarray, before: np.ndarray | None = None, number: int = 0) -> View:
-        """Path trace a state. before : interreflections of `number` states before, of which a mean is made, in place:
-        less noise, and as the surface hardly changes, hardly older."""
+    def view(self, guess: Guess, depth: np.ndarray) -> View:
+        """Path trace a state."""
         options = self.options
         dr.flush_malloc_cache()  # of the fit before
         self.rendering.update(guess, depth)
@@ -159,11 +160,6 @@ class Alternations:
             spp = max(options.spp, round(PATHS / self.data.mask.size))
             indirect = self.rendering.indirect(spp=spp, seed=int(self.rng.integers(2**31)))
             _smooth(indirect, self.data.mask, options.smoothing * np.sqrt(options.spp / spp))
-            if before is not None:
-                indirect -= before
-                indirect *= max(1 / (number + 1), AVERAGED)
-                before += indirect
-                indirect = before
         return self._seen(depth, indirect)
 
     def seen_again(self, course: Course) -> View:
@@ -174,7 +170,7 @@ class Alternations:
     def _seen(self, depth: np.ndarray, indirect: np.ndarray | None) -> View:
         shown = self.options.shadows
         seen = self.rendering.visible(self.lighting) if shown else np.ones(self.judge.counts.shape, bool)
-        return View(self.domain.points(depth), seen, indirect)
+        return View(self.domain.points(depth), self.domain.normals(depth), seen, indirect)
 
     def score(self, state: State, view: View) -> None:
         if self.judge.able:
@@ -211,7 +207,7 @@ class Alternations:
             course.state, course.number = state, course.number + 1
             if angles(before, state.guess.normals).mean() < self.options.tolerance:
                 course.most = course.number
-            view = self.view(state.guess, state.depth, view.indirect, course.number)
+            view = self.view(state.guess, state.depth)
             course.indirect = view.indirect
             self.score(state, view)
             course.judged()
@@ -225,6 +221,7 @@ class Alternations:
         for _ in range(INNER):
             model.fit_bsdf(guess, self.rng, coat=self.kind.coat)
             model.fit_normals(guess, steps=2, free_albedo=self.options.albedo)
+        self._begin_again(guess, model, view.normals)
         if self.options.albedo and guess.base is None:
             guess.albedo /= np.median(guess.albedo)
         pixels = self.rng.choice(model.P, min(2000, model.P), replace=False)
@@ -236,6 +233,16 @@ class Alternations:
             )
             guess.exposures[np.abs(np.log(guess.exposures)) < STATED] = 1
         return float(np.sqrt(residual) / model.scale)
+
+    def _begin_again(self, guess: Guess, model: DirectModel, normals: np.ndarray) -> None:
+        """From other normals, in place: pixels keep what they come to if it leaves less of their values. For those of
+        a glossy pixel have several minima, and a surface is there to tell which one is near."""
+        other = copy.deepcopy(guess)
+        other.normals = normals
+        model.fit_normals(other, steps=AGAIN, free_albedo=self.options.albedo)
+        less = model.losses(other) < model.losses(guess)
+        for name in ("normals", "albedo") + (() if guess.base is None else ("base",)):
+            getattr(guess, name)[less] = getattr(other, name)[less]
 
     def judged_start(
         self, guess: Guess, lights: tuple[np.ndarray, np.ndarray], kinds: tuple[Kind, ...]

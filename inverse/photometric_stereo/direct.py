@@ -169,6 +169,36 @@ class DirectModel(Lighting):
 
     # ---------------------- Of each pixel ----------------------
 
+    def losses(self, guess: Guess) -> np.ndarray:
+        """Huber's, of what is left of the values of each pixel, (P,)."""
+        exposures, bsdf, p = own(guess.exposures), bsdf_of(self.lobes, guess.weights), dr.arange(mi.UInt32, self.P)
+        normals, albedo = dr.gather(mi.Vector3f, own(guess.normals), p), dr.gather(mi.Float, own(guess.albedo), p)
+        base = None if guess.base is None else dr.gather(mi.Color3f, own(guess.base), p)
+        pixel, threshold = _Pixel(self, guess.base_eta, normals, albedo, base), dr.opaque(mi.Float, HUBER * self.scale)
+
+        def body(k, loss):
+            direction, irradiance = self.light(k, pixel.point)
+            scale = dr.gather(mi.Float, exposures, k) * irradiance
+            x = self._left(p * self.K + k, self._parts(pixel, bsdf, pixel.n, direction, scale)[1])
+            x = dr.norm(mi.Vector3f(x)) / threshold
+            return k + 1, loss + dr.gather(mi.Float, self.counts, p * self.K + k) * dr.select(x < 1, x * x / 2, x - 0.5)
+
+        begun = dr.zeros(mi.UInt32, self.P), dr.zeros(mi.Float, self.P)
+        return np.array(dr.while_loop(begun, lambda k, *_: k < self.K, body, label="losses")[1])
+
+    def _parts(self, pixel: _Pixel, bsdf: mi.BSDF, n, direction, scale) -> tuple[mi.Color3f, mi.Color3f]:
+        """Without colour and albedo: what is linear in them; and with these, all."""
+        f = self._reflected(bsdf, n, pixel.view, direction) * scale
+        if pixel.base is None:
+            return f, pixel.a * f
+        g = diffuse(pixel.base_eta, n, pixel.view, direction) * scale
+        return g, pixel.a * f + pixel.base * g
+
+    def _left(self, entry: mi.UInt32, total: mi.Color3f) -> mi.Color3f:
+        """Of a value, without what is reflected directly and indirectly."""
+        left = dr.gather(mi.Color3f, self.values, entry) - total
+        return left if self.indirect is None else left - dr.gather(mi.Color3f, self.indirect, entry)
+
     def fit_normals(self, guess: Guess, *, steps: int = 3, free_albedo: bool = True, turn: bool = True) -> None:
         """Gauss-Newton steps of every pixel, in place: of its normal, and its albedo or its colour.
 
@@ -196,7 +226,7 @@ class DirectModel(Lighting):
     def _sums(self, pixel: _Pixel, exposures: mi.Float, bsdf: mi.BSDF) -> list[mi.Float]:
         """Over the lights, of what the equations of `_Pixel.stepped` are made: products of the two derivatives with
         respect to turns and of the residual; then those with the derivatives with respect to what is linear."""
-        p, v = pixel.number, pixel.view
+        p = pixel.number
         coloured = pixel.base is not None
         turned = [dr.normalize(pixel.n + TURN * t) for t in (pixel.frame.s, pixel.frame.t)]
         threshold = dr.opaque(mi.Float, HUBER * self.scale)
@@ -207,19 +237,9 @@ class DirectModel(Lighting):
             direction, irradiance = self.light(k, pixel.point)
             entry = p * self.K + k
             scale = dr.gather(mi.Float, exposures, k) * irradiance
-
-            def parts(n):
-                """Without colour and albedo: what is linear in them; and with these, all."""
-                f = self._reflected(bsdf, n, v, direction) * scale
-                if not coloured:
-                    return f, pixel.a * f
-                g = diffuse(pixel.base_eta, n, v, direction) * scale
-                return g, pixel.a * f + pixel.base * g
-
+            parts = lambda n: self._parts(pixel, bsdf, n, direction, scale)
             linear, total = parts(pixel.n)
-            residual = dr.gather(mi.Color3f, self.values, entry) - total
-            if self.indirect is not None:
-                residual -= dr.gather(mi.Color3f, self.indirect, entry)
+            residual = self._left(entry, total)
             columns = [(parts(t)[1] - total) / TURN for t in turned]
             size = dr.norm(mi.Vector3f(residual))
             w = dr.gather(mi.Float, self.counts, entry) * dr.minimum(1, threshold / dr.maximum(size, 1e-20)) * unit

@@ -60,12 +60,13 @@ class Kind:
     def of(self, guess: Guess, lobes: ggx.Lobes) -> Guess:
         """A copy of a guess, in which the material is of this kind."""
         guess = copy.deepcopy(guess)
+        if self.several:
+            guess.base_eta = self.base_eta(lobes)
         if self.several and guess.base is None:
             matte = np.isnan(lobes.alpha)
             guess.base = guess.albedo[:, None] * guess.weights[matte].sum(0)
             guess.weights[matte] = 0
             guess.albedo = np.ones_like(guess.albedo)
-            guess.base_eta = self.base_eta(lobes)
         return guess
 
 

@@ -270,7 +270,9 @@ class Reconstruction:
             if now.start is None:
                 view = self._begin(most, coarse)
             elif now.course is None:
-                now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=np.nan), most)
+                # Of another kind, never the best as it is: its judge fits the material, but its normals are not fitted
+                unknown = np.nan if kind == now.settled.kind else np.inf
+                now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=unknown), most)
             now.end_trial(self.work.run(now.course, self._record, view))
         if now.level == len(options.resolutions) - 1:
             self._take_back()

@@ -14,10 +14,10 @@ from photometric import LAMBERT, UP, disc, glossy
 from rimlight import ggx
 from rimlight.checks import mean_and_error
 from rimlight.inverse.photometric_stereo import reconstruction, refinement
-from rimlight.inverse.photometric_stereo.alternation import State
+from rimlight.inverse.photometric_stereo.alternation import Alternations, State
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
 from rimlight.inverse.photometric_stereo.descent import ExponentiatedGradient, NormalAdam
-from rimlight.inverse.photometric_stereo.direct import DirectModel, Guess, simplex_least_squares
+from rimlight.inverse.photometric_stereo.direct import HUBER, DirectModel, Guess, simplex_least_squares
 from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering
 from rimlight.inverse.photometric_stereo.simulation import spiral
@@ -179,6 +179,37 @@ def test_values_that_do_not_count_and_indirect_light(plastic: Scene) -> None:
     model.fit_bsdf(guess, rng)
     change = plastic.model().predicted(guess) - plastic.data.values
     assert np.abs(change).mean() < 0.003 * plastic.data.values.mean()
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_losses_of_pixels(plastic: Scene, several: bool) -> None:
+    """Those of Huber, of what is not predicted."""
+    rng, lobes = np.random.default_rng(0), plastic.rendering.lobes
+    guess = Kind(several=several, coat=True).of(plastic.guess, lobes)
+    guess.normals = unit(guess.normals + np.array([0.1, 0, 0]))
+    counts = rng.uniform(0, 1, plastic.data.values.shape[:2]).astype(np.float32)
+    indirect = rng.uniform(0, 0.1, plastic.data.values.shape) * plastic.model().scale
+    model = DirectModel(plastic.data, lobes, counts=counts, indirect=indirect)
+    x = np.linalg.norm(model.predicted(guess) - plastic.data.values, axis=2) / (HUBER * model.scale)
+    expected = (counts * np.where(x < 1, x**2 / 2, x - 0.5)).sum(1)
+    assert (x < 1).any() and (x > 1).any()
+    np.testing.assert_allclose(model.losses(guess), expected, rtol=1e-3)
+
+
+def test_pixels_begin_again_from_the_normals_of_the_surface(plastic: Scene) -> None:
+    """Where that leaves less of their values; and else stay as they are."""
+    data, lobes, rng = plastic.data, plastic.rendering.lobes, np.random.default_rng(0)
+    counts = np.ones(data.values.shape[:2], np.float32)
+    judge = Judge(data, lobes, left_out(data, 0), counts, 0, "trimmed")
+    work = Alternations(data, lobes, Kind(), judge, reconstruction.Options(max_depth=2), rng)
+    wrong = unit(plastic.guess.normals + np.array([1.0, 1.0, 0]))
+    half = np.arange(len(wrong)) < len(wrong) / 2
+    guess = dataclasses.replace(deepcopy(plastic.guess), normals=np.where(half[:, None], wrong, plastic.guess.normals))
+    before = deepcopy(guess)
+    work._begin_again(guess, plastic.model(), np.where(half[:, None], plastic.guess.normals, wrong))
+    assert angles(guess.normals, plastic.guess.normals).max() < 0.5
+    np.testing.assert_allclose(guess.albedo, plastic.guess.albedo, rtol=0.02)
+    assert angles(before.normals, plastic.guess.normals)[half].min() > 20
 
 
 def test_outliers(plastic: Scene) -> None:

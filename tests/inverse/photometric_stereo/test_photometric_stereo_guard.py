@@ -32,6 +32,7 @@ from rimlight.inverse.photometric_stereo import (
     taking_back,
 )
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.direct import Guess
 from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering, unlit
 
@@ -156,6 +157,7 @@ def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(taking_back, "WIDTH", 1.0)
     monkeypatch.setattr(Judge, "disagreement", disagreement)
     monkeypatch.setattr(alternation.State, "beats", lambda self, start: True)
+    monkeypatch.setattr(alternation.State, "better_than", lambda self, other: True)
     options = ps.Options(**QUICK, reflectance=False)
     found = ps.reconstruct(matte, options, progress=False, after=lambda r: states.append(r.guess.normals.copy()))
     columns = np.nonzero(matte.mask)[1]
@@ -188,10 +190,67 @@ def test_other_materials_must_be_clearly_better() -> None:
     assert state(0.09, 4.0, Kind(several=True)).needed_beside(plain)
     assert not state(0.09, 4.5, Kind(several=True)).needed_beside(plain)
     assert not state(0.097, 3.0, Kind(several=True)).needed_beside(plain)
-    assert state(0.099, 5.0, Kind()).better_than(plain)
-    coated = state(0.1, 5.0, Kind(coat=True))
-    assert not state(0.097, 3.0, Kind(coat=True)).better_than(coated)
-    assert state(0.095, 5.0, Kind(coat=True)).better_than(coated)
+
+
+def test_states_are_compared_by_predictions_and_halves_together() -> None:
+    """Under a coat, too. Where halves are not known, by predictions; where nothing is, the newer one is kept."""
+    state = lambda left_out, halves: alternation.State(None, None, Kind(coat=True), left_out=left_out, halves=halves)
+    before = state(0.1, 5.0)
+    assert state(0.101, 4.9).better_than(before)
+    assert not state(0.103, 4.9).better_than(before)
+    assert not state(0.099, 5.1).better_than(before)
+    assert state(0.099, np.nan).better_than(before)
+    assert state(0.11, 6.0).better_than(state(np.inf, np.nan))
+    assert state(np.nan, np.nan).better_than(before)
+
+
+def test_a_coat_is_put_on_colours_and_taken_off() -> None:
+    lobes, count = ggx.read_dictionary()[0], 4
+    bare = Guess(np.zeros((count, 3)), np.ones(count), np.ones(2), np.full((len(lobes), 3), 0.01))
+    plain = Kind(several=True).of(bare, lobes)
+    assert np.isnan(plain.base_eta)
+    coated = Kind(several=True, coat=True).of(plain, lobes)
+    assert coated.base_eta == 1.5 and np.isnan(Kind(several=True).of(coated, lobes).base_eta)
+    np.testing.assert_array_equal(coated.base, plain.base)
+
+
+def test_of_another_material_only_what_was_fitted_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = []
+    run = alternation.Alternations.run
+
+    def noted(self, course, record, view=None):
+        unfitted = course.state.guess.normals.copy()
+        best = run(self, course, record, view)
+        begun.append((self.kind.coat, np.array_equal(best.guess.normals, unfitted)))
+        return best
+
+    # Each state is worse than the one before
+    scores = iter(np.arange(1.0, 99.0))
+    score = lambda self, state, view: setattr(state, "left_out", next(scores))
+    monkeypatch.setattr(alternation.Alternations, "score", score)
+    monkeypatch.setattr(alternation.Alternations, "judged_start", lambda self, guess, *_: (alternation.State(
+        guess, self.integrate(guess), self.kind, 99.0, start=True), None))  # fmt: skip
+    monkeypatch.setattr(alternation.Alternations, "run", noted)
+    ps.reconstruct(matte, ps.Options(**QUICK, materials="one"), progress=False)
+    assert begun[1:] == [(False, True), (True, False)]
+
+
+def test_each_state_has_the_interreflections_of_the_one_before(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No mean of older ones, of wrong surfaces."""
+    made, used, fit = iter(range(1, 99)), [], alternation.Alternations.fit
+
+    def noted(self, guess, view):
+        used.append(view.indirect.max())
+        return fit(self, guess, view)
+
+    def indirect(self, *, spp: int, seed: int) -> np.ndarray:
+        return np.full_like(self.data.values, 1e-6 * next(made))
+
+    monkeypatch.setattr(Rendering, "indirect", indirect)
+    monkeypatch.setattr(alternation.Alternations, "fit", noted)
+    options = ps.Options(**{**QUICK, "max_depth": 3, "iterations": (4,)}, reflectance=False, tolerance=0.0)
+    ps.reconstruct(matte, options, progress=False)
+    np.testing.assert_allclose(used, 1e-6 * np.arange(1, 5), rtol=1e-4)
 
 
 def test_the_coat_is_reconsidered_at_the_largest_size(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
