@@ -92,8 +92,6 @@ test_bdpt_edge.py::test_interior_is_that_of_path_replay[rough_panes
 test_bdpt_edge.py::test_interior_is_that_of_path_replay[spot_behind_screen
 test_bdpt_edge.py::test_shadows_continued_from_the_light
 test_bdpt_edge.py::test_shadows_in_light_from_surfaces
-test_blinn_phong.py::test_frozen
-test_blinn_phong.py::test_samples_agree_with_values
 test_blinn_phong.py::test_shadows_and_reflections_move
 test_blinn_phong.py::test_textures_in_a_render[diffuse_reflectance-direct_edge]
 test_blinn_phong.py::test_textures_in_a_render[roughness-prb_edge]
