@@ -174,13 +174,13 @@ def compare(derivatives: np.ndarray, reference: FiniteDifferences, *, tolerance:
 
 
 def two_sides(before: FiniteDifferences, after: FiniteDifferences) -> tuple[float, float]:
-    """By how much differences to both sides are apart: sum of absolute values, relative to that of their mean; and what
-    noise alone would make of it, at most.
+    """By how much differences to both sides are apart: sum of absolute values, relative to the mean of theirs, so 2 at
+    most; and what noise alone would make of it, at most.
 
     before, after : `finite_differences` with the sides -1 and 1. If they are apart, however small the step is, the
         image has no derivative: it depends on the side.
     """
-    size = float(np.abs(before.mean + after.mean).sum() / 2)
+    size = float((np.abs(before.mean) + np.abs(after.mean)).sum() / 2)
     apart = float(np.abs(after.mean - before.mean).sum())
     # Of a normal distribution, the mean of absolute values is √(2/π) standard deviations.
     noise = float(np.sqrt(2 / np.pi) * (before.standard_error + after.standard_error).sum())

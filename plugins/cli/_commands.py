@@ -212,8 +212,8 @@ class FiniteDifferencesCommand(OnMotion):
         return 0
 
 
-#: How far apart one-sided differences may be, relative to central ones, where an image has a derivative: edges enter
-#: and leave pixels within a step.
+#: How far apart one-sided differences may be (`two_sides`) where an image has a derivative: edges enter and leave
+#: pixels within a step.
 BENDS = 0.25
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from rimlight.checks import Motion, finite_differences, two_sides
+from rimlight.checks import FiniteDifferences, Motion, finite_differences, two_sides
 
 #: Pixels along a side of the film, and how many of them a lamp and a card before it are wide.
 SIZE, WIDTH = 16, 8
@@ -57,6 +59,14 @@ def test_sides_of_what_comes_into_view(hides, left, right):
     np.testing.assert_allclose((before.mean + after.mean) / 2, central.mean, atol=0.05)
     apart, noise = two_sides(before, after)
     if left:
-        assert apart > 1.5
+        assert apart == pytest.approx(2, abs=0.1)
     else:
         assert apart < 0.1 + 2 * noise
+
+
+def test_sides_that_cancel_are_apart():
+    up = FiniteDifferences(np.ones((2, 2, 3)), np.full((2, 2, 3), 0.1), np.zeros((2, 2, 3)), {})
+    down = replace(up, mean=-up.mean)
+    apart, noise = two_sides(down, up)
+    assert apart == 2 and noise < 0.2
+    assert two_sides(up, up)[0] == 0
