@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from rimlight import ggx
 
-from . import calibration
+from . import calibration, in_shadow
 from .dataset import LUMINANCE, Dataset, angles
 from .direct import DirectModel, Guess, Lighting
 from .evidence import FAR, Judge, Kind
@@ -49,7 +49,7 @@ PATIENCE = 3
 class State:
     """guess, and depth, (Q,), with the kind of its material. left_out : how far the values that were left out are off
     what is predicted, in the mean value of each pixel; NaN if there are too few lights. uncertain : its standard error.
-    start : is it the start?"""
+    strength : of its interreflections, as of `View`. start : is it the start?"""
 
     guess: Guess
     depth: np.ndarray
@@ -58,6 +58,7 @@ class State:
     uncertain: float = 0.0
     halves: float = np.nan
     curl: float = np.nan
+    strength: float = np.nan
     start: bool = False
 
     def better_than(self, other: State | None) -> bool:
@@ -112,12 +113,14 @@ class Course:
 @dataclass
 class View:
     """What a state shows: points, (P, 3), and normals, (P, 3), of its depth; which lights its surface does not hide,
-    (P, K); and what it reflects on itself, (P, K, 3), or None."""
+    (P, K); and what it reflects on itself, (P, K, 3), or None. strength : the factor by which this was multiplied, so
+    that it is what the images show in shadow; NaN where they do not tell."""
 
     points: np.ndarray
     normals: np.ndarray
     seen: np.ndarray
     indirect: np.ndarray | None
+    strength: float = np.nan
 
 
 @dataclass
@@ -160,7 +163,12 @@ class Alternations:
             spp = max(options.spp, round(PATHS / self.data.mask.size))
             indirect = self.rendering.indirect(spp=spp, seed=int(self.rng.integers(2**31)))
             _smooth(indirect, self.data.mask, options.smoothing * np.sqrt(options.spp / spp))
-        return self._seen(depth, indirect)
+        view = self._seen(depth, indirect)
+        if indirect is not None:
+            view.strength = in_shadow.strength(self.data, indirect, ~view.seen & self.domain.lit[:, None])
+            if np.isfinite(view.strength):
+                view.indirect *= np.float32(view.strength)
+        return view
 
     def seen_again(self, course: Course) -> View:
         """The view of the newest state, of which the interreflections are known."""
@@ -173,6 +181,7 @@ class Alternations:
         return View(self.domain.points(depth), self.domain.normals(depth), seen, indirect)
 
     def score(self, state: State, view: View) -> None:
+        state.strength = view.strength
         if self.judge.able:
             of_view = view.points, view.seen, view.indirect
             errors = self.judge.errors(state.guess, self.kind, *of_view)
@@ -247,15 +256,19 @@ class Alternations:
     def judged_start(
         self, guess: Guess, lights: tuple[np.ndarray, np.ndarray], kinds: tuple[Kind, ...]
     ) -> tuple[State, View | None]:
-        """The start, with its normals held, as its best material of these kinds predicts what was left out; and its
-        view, if anything was. lights : as of `Judge.errors`."""
+        """The start, with its normals held, as its best material of these kinds predicts what was left out, with
+        interreflections or without, which a matte surface of other normals may also explain; and its view, if anything
+        was left out. lights : as of `Judge.errors`."""
         depth = self.integrate(guess)
         state, view = State(guess, depth, Kind(), start=True), None
         if self.judge.able:
             view = self.view(self.kind.of(guess, self.lobes), depth)
             of_view = view.points, view.seen, view.indirect
+            state.strength = view.strength
             state.left_out = min(
-                float(self.judge.errors(guess, kind, *of_view, lights=lights).mean()) for kind in kinds
+                float(self.judge.errors(guess, kind, *of_view[:2], indirect, lights=lights).mean())
+                for kind in kinds
+                for indirect in ([None] if view.indirect is None else [None, view.indirect])
             )
             state.halves = _mean(self.judge.disagreement(guess, *of_view, lights=lights))
             state.curl = self._curl(state)

@@ -81,6 +81,7 @@ def write_numbers(
         "halves": {name: None if np.isnan(angle) else angle for name, angle in result.halves.items()},
         "curl": {name: None if np.isnan(angle) else angle for name, angle in result.curl.items()},
         "taken_back": result.taken_back,
+        "strength": None if np.isnan(result.strength) else result.strength,
         "doubts": list(result.doubts),
         "seconds": round(result.seconds, 3),
         "size": [*data.mask.shape[::-1]],
@@ -144,6 +145,11 @@ def judgement(result: Result) -> list[str]:
         start, found = (f"{result.halves[name]:.2g}°" for name in ("start", "result"))
         sentences.append(
             f"normals of one half of the lights and of the other differ by {found}, at the start by {start}"
+        )
+    if np.isfinite(result.strength):
+        sentences.append(
+            f"interreflections count {result.strength:.2g} times what the surface that was found makes: so bright is "
+            "its shadow in the images"
         )
     if result.taken_back > 0:
         sentences.append(f"{100 * result.taken_back:.2g} % of the surface is taken back to the start")
