@@ -250,7 +250,8 @@ class ShadingBoundary:
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
             def see(side, active, slack=1):
-                return look(scene, si, x, p, side * aside * across, slack * aside, distance, active)
+                ray, pi, y, hidden, own = look(scene, si, x, p, side * aside * across, slack * aside, distance, active)
+                return ray, pi, y, hidden | (own & outline.is_behind(y.n, ω)), own
 
             side = dr.select(outward != 0, outward, 1)
             ray, pi, y, hidden, own = see(side, active)
