@@ -17,6 +17,7 @@ from .geometry.cut_curves import CutCurves
 from .geometry.edges import EdgeKind, Edges, Weld, find_edges, find_welded_edges
 from .geometry.intersections import Intersections
 from .geometry.meshes import Geometry, objects_below
+from .geometry.rims import Rims
 from .geometry.sources import Sources
 from .geometry.texture_lines import TextureLines, jumping_textures, maps_in_steps
 from .lights import Lights
@@ -48,6 +49,7 @@ __all__ = [
     "Lobe",
     "Projection",
     "Reservoir",
+    "Rims",
     "ShadingBoundary",
     "ShadowBoundary",
     "ShadowSamples",

@@ -31,6 +31,7 @@ from building import (
 from cuts import CURVES, CUTS
 from hidden_lights import HIDDEN
 from instances import INSTANCES
+from joints import JOINTS
 from mirrors import MIRRORS, ball_of_index
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
@@ -910,7 +911,7 @@ CASES = [
     ),
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k.endswith("_slides") else 1024)
-        for k, (*of, depth) in (INSTANCES | CURVES).items()
+        for k, (*of, depth) in (INSTANCES | CURVES | JOINTS).items()
     ),
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")

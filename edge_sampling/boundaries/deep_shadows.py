@@ -73,7 +73,7 @@ class DeepShadows(ShadowBoundary):
             distance = dr.norm(edge.p - start)
             active &= ~in_plane(x, edge.p)
             aside = self.silhouettes.beside(scene, placement, edge.sample, edge.p, start)
-            ray, pi, y, *_ = look(scene, x, start, edge.p, aside * edge.lit, aside, distance, active)
+            ray, pi, y, *_ = look(scene, x, start, edge.p, edge.outline, aside * edge.lit, aside, distance, active)
             active &= pi.is_valid() & (pi.shape == sender.si.shape)
             cos_y = dr.abs_dot(y.n, ray.d)
             # The line from y ends at x, rays start above it.

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.device_edges import line_of_sight
+from rimlight.edge_sampling.geometry.device_edges import line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.lights import Lights
@@ -223,9 +223,17 @@ class FilmBoundary:
             # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
             # that: a jump of the contour's, which would count twice.
             c = found.curve
-            wall = projection.tangent(c.p, mi.Point3f(c.p + c.inwards), mi.Float(0), at.aperture_sample)
+            across = lambda v: dr.dot(projection.tangent(c.p, mi.Point3f(c.p + v), mi.Float(0), at.aperture_sample), n)
             missed = [outlines.curves.misses(at.frames, chosen.piece, ray) for ray in rays]
-            jumps &= ~chosen.is_curve | ~dr.select(dr.dot(wall, n) > 0, missed[1], missed[0])
+            jumps &= ~chosen.is_curve | ~dr.select(across(c.inwards) > 0, missed[1], missed[0])
+            if outlines.curves.any_joined:
+                # Between rims that coincide, rounding may let a ray through.
+                joined = chosen.is_curve & outlines.curves.joined(chosen.piece)
+                faces = across(c.inwards), across(c.other)
+                for sign, ray, pi in zip((-1, 1), rays, met, strict=True):
+                    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, joined)
+                    there = si.is_valid() & (dr.abs_dot(si.n, si.p - p) <= rounding(p, ray.o))
+                    jumps &= ~joined | there | ((sign * faces[0] < 0) & (sign * faces[1] < 0))
         return jumps
 
     def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays) -> list[Horizon | None]:

@@ -108,14 +108,12 @@ class FilmOutlines:
         matt = matt[edges.mesh].all(1)
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
-        shapes = zip(geometry.analytic, moving[len(geometry.meshes) :], strict=True)
-        shapes = tuple(s for s, moves in shapes if moves)
-        self.curves = Curves(shapes, seams=seams) if shapes else None
+        self.curves = Curves.of(geometry, moving[len(geometry.meshes) :], seams=seams)
         horizons = Horizons(geometry, moving[: len(geometry.meshes)])
         self.horizons = horizons if len(horizons) else None
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
         cuts = len(faces) if len(edges) else 0
-        self.counts = (len(edges), cuts, len(horizons), len(self.curves) if shapes else 0)
+        self.counts = (len(edges), cuts, len(horizons), len(self.curves) if self.curves is not None else 0)
 
     @property
     def any_smooth(self) -> bool:

@@ -250,7 +250,7 @@ class ShadingBoundary:
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
             def see(side, active, slack=1):
-                return look(scene, si, x, p, side * aside * across, slack * aside, distance, active)
+                return look(scene, si, x, p, outline, side * aside * across, slack * aside, distance, active)
 
             side = dr.select(outward != 0, outward, 1)
             ray, pi, y, hidden, own = see(side, active)
@@ -393,18 +393,20 @@ def _chosen(
     return e, for_emission
 
 
-def look(scene, si, x, p, beside, aside, distance, active):
+def look(scene, si, x, p, outline, beside, aside, distance, active):
     """What is seen from x at the point p of an edge and a little beside it: ray, intersections; whether something
     before the edge hides it; and whether it is a surface on which the edge lies.
 
-    aside : how far from the edge such a surface may be. distance : from x to p.
+    outline : what is known of the edge there. aside : how far from the edge such a surface may be. distance : from x
+    to p.
     """
     ray = spawn_ray(scene, si, dr.normalize(mi.Point3f(p + beside) - x))
     pi = scene.ray_intersect_preliminary(ray, active=active)
     y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     # Not a surface on which the edge lies: beside the edge, that may be met a little earlier.
     off = dr.abs_dot(y.n, p - y.p) > aside
-    return ray, pi, y, pi.is_valid() & (pi.t < distance) & off, pi.is_valid() & ~off
+    hidden = dr.select(off, pi.t < distance, outline.is_behind(y.n, ray.d))
+    return ray, pi, y, pi.is_valid() & hidden, pi.is_valid() & ~off
 
 
 def turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:

@@ -23,7 +23,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.emitter_boxes import SLACK
 from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic
-from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
+from rimlight.edge_sampling.choice.silhouettes import OutlinePoint, Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Cone, View
 from rimlight.edge_sampling.geometry.device_edges import beside_edge, rounding
 from rimlight.edge_sampling.lights import Lights
@@ -236,7 +236,8 @@ class ShadowBoundary:
         across = dr.normalize(dr.cross(ω, outline.tangent))
         lit = across * outline.outward(across, ω)
         emits = dr.select(light.on_surface, dr.dot(light.n, ω), 1) > 0
-        return LitEdge(e, outline.p, outline.tangent, lit, d, ω, (e.density > 0) & emits & dr.any(lit != 0))
+        active = (e.density > 0) & emits & dr.any(lit != 0)
+        return LitEdge(e, outline.p, outline.tangent, lit, d, ω, active, outline)
 
     # ---------------------- What arrives where the shadow falls ----------------------
 
@@ -317,6 +318,7 @@ class LitEdge:
     """A point p of an edge as the light sees it, with the tangent there.
 
     lit : unit vector across edge and light, towards the lit side. d, ω : from the light to p, ω of unit length.
+    outline : all that is known of the point; None where it is on no edge.
     """
 
     sample: EdgeSample
@@ -326,6 +328,7 @@ class LitEdge:
     d: mi.Vector3f
     ω: mi.Vector3f
     active: mi.Bool
+    outline: OutlinePoint | None = None
 
 
 @dataclass
@@ -369,6 +372,9 @@ def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
     active = edge.active & fallen.is_valid()
     # A ray towards the light will start above the surface: from where it starts, it must meet the edge.
     hit = fallen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+    if edge.outline is not None:
+        on_edge = dr.abs_dot(hit.n, hit.p - p) <= rounding(p, dr.select(far, p, light.y))
+        active &= ~(on_edge & edge.outline.is_behind(hit.n, ω))
     facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
     lift = dr.dot(spawn_ray(scene, hit, -ω).o - hit.p, facing)
     cos_x = -dr.dot(facing, ω)

@@ -20,6 +20,10 @@ from .views import View
 #: Part of the samples that are for curves, where there are edges, too.
 CURVE_PART = 0.5
 
+#: An edge on a surface lies behind it if its faces rise from that, away from the viewer, by more than this: sine of the
+#: angle.
+RISES = 1e-3
+
 
 @dataclass
 class Placement:
@@ -41,12 +45,14 @@ class OutlinePoint:
     tangent : mi.Vector3f, dp/dt, where t is the parameter that was sampled. Detached.
     inwards : two vectors from p towards the faces on the two sides of an edge. Detached.
     is_line : is it on a line in which shapes cut through each other? Then both faces go on beyond it.
+    slides : is it on a contour, which slides over its surface?
     """
 
     p: mi.Point3f
     tangent: mi.Vector3f
     inwards: tuple[mi.Vector3f, mi.Vector3f]
     is_line: mi.Bool
+    slides: mi.Bool
 
     @property
     def normals(self) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -65,6 +71,14 @@ class OutlinePoint:
         inwards = [dr.dot(v, across) for v in self.inwards]
         inwards = dr.select(dr.abs(inwards[0]) > dr.abs(inwards[1]), inwards[0], inwards[1])
         return dr.select(faces[0] != faces[1], -dr.sign(inwards), 0)
+
+    def is_behind(self, n: mi.Vector3f, ω: mi.Vector3f) -> mi.Bool:
+        """Do its faces lie behind a surface in which the point is? Then that hides the edge.
+
+        n : normal of the surface. ω : from the viewer; both of unit length.
+        """
+        rises = [dr.mulsign(dr.dot(v, n), dr.dot(n, ω)) > RISES * dr.norm(v) for v in self.inwards]
+        return rises[0] & rises[1] & ~self.slides
 
 
 class Silhouettes:
@@ -96,7 +110,7 @@ class Silhouettes:
         #: Number of groups of edges.
         self.groups = len(groups)
         self.tree = EdgeTree(geometry, edges, groups) if groups else None
-        self.curves = Curves(geometry.analytic) if geometry.analytic else None
+        self.curves = Curves(geometry.analytic, geometry.joints) if geometry.analytic else None
         self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
 
     def __len__(self) -> int:
@@ -181,11 +195,16 @@ class Silhouettes:
 
     def crease(self, sample: EdgeSample, outline: OutlinePoint) -> mi.Float:
         """About how much jumps at a point if both faces are seen, see `DeviceEdges.crease`."""
+        of_rims = mi.Float(0)
+        if self.curves is not None:
+            piece = dr.select(sample.edge < self.count, 0, sample.edge - self.count)
+            of_rims = dr.select(self.curves.joined(piece), mi.Float(1), 0)
         if self.tree is None:
-            return mi.Float(0)
+            return of_rims
         first, second = (dr.normalize(n) for n in outline.normals)
         edge = dr.select(sample.edge < self.count, sample.edge, 0)
-        return self.tree.device_edges.crease(edge, dr.norm(dr.cross(first, second)))
+        of_edges = self.tree.device_edges.crease(edge, dr.norm(dr.cross(first, second)))
+        return dr.select(sample.edge < self.count, of_edges, of_rims)
 
     def preferred(self, sample: EdgeSample, use: list[mi.Float | float]) -> mi.Float:
         """How much the group is preferred in which an edge is, see `sample_edge`."""
@@ -225,7 +244,7 @@ class Silhouettes:
             with dr.suspend_grad():
                 inwards = tuple(dr.detach(o - p) for o in edges.opposite(placement.positions, index))
                 is_line = index >= self._first_line if self.lines else mi.Bool(False)
-                point = OutlinePoint(p, dr.detach(b - a), inwards, is_line)
+                point = OutlinePoint(p, dr.detach(b - a), inwards, is_line, mi.Bool(False))
             if edges.curves is not None:
                 curved, on_curve, tangent = edges.on_curve(placement.positions, index, sample.t)
                 point.p = dr.select(curved, on_curve, point.p)
@@ -237,11 +256,11 @@ class Silhouettes:
             piece = dr.select(on_edge, 0, piece)
         c = self.curves.point(placement.frames, piece, sample.t, eye, far)
         # Where there is none, both sides seem to have a face.
-        inwards = (c.inwards, dr.select(c.valid, c.inwards, -c.inwards))
-        on_curve = OutlinePoint(c.p, c.tangent, inwards, mi.Bool(False))
+        inwards = (c.inwards, dr.select(c.valid, c.other, -c.inwards))
+        on_curve = OutlinePoint(c.p, c.tangent, inwards, mi.Bool(False), c.slides)
         if self.tree is None:
             return on_curve
         choose = lambda x, y: dr.select(on_edge, x, y)
         inwards = tuple(choose(x, y) for x, y in zip(point.inwards, on_curve.inwards, strict=True))
         p, tangent = choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent)
-        return OutlinePoint(p, tangent, inwards, point.is_line & on_edge)
+        return OutlinePoint(p, tangent, inwards, point.is_line & on_edge, c.slides & ~on_edge)

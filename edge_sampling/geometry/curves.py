@@ -3,15 +3,23 @@
 The rim of a disk, and the two of a cylinder, are fixed on their shape, like an open edge. The contour of a sphere, and
 the two lines along which a cylinder turns away, slide over the shape as the viewer moves. This does not matter: the
 motion of a contour across the line of sight is that of the *material* points that lie on it.
+
+Where rims coincide, as where a disk closes a cylinder, one of them stands for all. It has two faces, like an edge
+between triangles, and moves as both do on average.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+if TYPE_CHECKING:
+    from .meshes import Geometry
 
 
 class CurveKind(IntEnum):
@@ -36,6 +44,9 @@ CURVES = {
     "Cylinder": (CurveKind.BOTTOM, CurveKind.TOP, CurveKind.LEFT, CurveKind.RIGHT),
 }
 
+#: Those that are fixed on their shapes, and may coincide with others (`rims.py`).
+RIMS = (CurveKind.RIM, CurveKind.BOTTOM, CurveKind.TOP)
+
 #: Lines on these shapes at which their texture coordinates jump: in the half-plane y = 0, x > 0 of their own frame.
 SEAMS = {
     "Sphere": CurveKind.SEAM_OF_SPHERE,
@@ -54,12 +65,16 @@ class CurvePoint:
     p : mi.Point3f, world space; attached to the motion of its shape.
     tangent : mi.Vector3f, dp/dt along the piece. Detached.
     inwards : mi.Vector3f, from p towards the shape. Detached.
+    other : mi.Vector3f, from p towards the second shape, where rims coincide; elsewhere as `inwards`. Detached.
+    slides : mi.Bool, is it on a contour, which slides over its shape?
     valid : mi.Bool, is there one? A viewer inside of a sphere sees no contour.
     """
 
     p: mi.Point3f
     tangent: mi.Vector3f
     inwards: mi.Vector3f
+    other: mi.Vector3f
+    slides: mi.Bool
     valid: mi.Bool
 
 
@@ -69,19 +84,42 @@ class Curves:
     Parameters
     ----------
     shapes : of the classes in `CURVES`.
+    joints : rims that coincide, see `Geometry.joints`, by the numbers of `shapes`.
     seams : are the seams of their texture coordinates among them?
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("count", "_shapes", "_seams", "_kind", "_shape"))  # for `dr.freeze`
+    _OTHER = ("any_joined", "_joined", "_other_kind", "_other_shape")
+    DRJIT_STRUCT = dict.fromkeys(("count", "_shapes", "_seams", "_kind", "_shape", *_OTHER))  # for `dr.freeze`
 
-    def __init__(self, shapes: tuple[mi.Shape, ...], *, seams: bool = False):
+    def __init__(self, shapes: tuple[mi.Shape, ...], joints: tuple = (), *, seams: bool = False):
         self._shapes, self._seams = shapes, seams
         curves = [(kind, i) for i, s in enumerate(shapes) for kind in CURVES[s.class_name()]]
         curves += [(SEAMS[s.class_name()], i) for i, s in enumerate(shapes)] if seams else []
+        second = {joint[0]: joint[1] for joint in joints}
+        left_out = {rim for joint in joints for rim in joint[1:]}
+        curves = [c for c in curves if c not in left_out]
+        others = [second.get(c, c) for c in curves]
         #: Number of curves.
         self.count = len(curves)
+        #: Do rims coincide?
+        self.any_joined = bool(second)
         # Not in NumPy's memory, for frozen functions.
-        self._kind, self._shape = (mi.UInt32([int(c[k]) for c in curves]) * dr.opaque(mi.UInt32, 1) for k in (0, 1))
+        index = lambda rims, k: mi.UInt32([int(c[k]) for c in rims]) * dr.opaque(mi.UInt32, 1)
+        self._kind, self._shape = (index(curves, k) for k in (0, 1))
+        self._other_kind, self._other_shape = (index(others, k) for k in (0, 1))
+        self._joined = (self._kind != self._other_kind) | (self._shape != self._other_shape)
+
+    @staticmethod
+    def of(geometry: Geometry, moving: np.ndarray, *, seams: bool = False) -> Curves | None:
+        """Those of shapes that move, and of others with which these have a rim in common; None if there are none.
+
+        moving : (S,), bool, of `geometry.analytic`.
+        """
+        joints = [joint for joint in geometry.joints if any(moving[i] for _, i in joint)]
+        chosen = sorted({*np.flatnonzero(moving).tolist(), *(i for joint in joints for _, i in joint)})
+        number = {i: k for k, i in enumerate(chosen)}
+        renumbered = tuple(tuple((kind, number[i]) for kind, i in joint) for joint in joints)
+        return Curves(tuple(geometry.analytic[i] for i in chosen), renumbered, seams=seams) if chosen else None
 
     def __len__(self) -> int:
         """Number of pieces."""
@@ -148,7 +186,29 @@ class Curves:
         with dr.suspend_grad():
             x, y, z = dr.detach(x), dr.detach(y), dr.detach(z)
             to_world = lambda w: x * w.x + y * w.y + z * w.z
-            return CurvePoint(p, to_world(tangent) / PIECES, to_world(inwards), valid)
+            tangent, inwards = to_world(tangent) / PIECES, to_world(inwards)
+        if not self.any_joined:
+            return CurvePoint(p, tangent, inwards, inwards, contour | side, valid)
+        joined, q, other = self._of_second(frames, curve, dr.detach(p))
+        p, other = dr.select(joined, 0.5 * (p + q), p), dr.select(joined, other, inwards)
+        return CurvePoint(p, tangent, inwards, other, contour | side, valid)
+
+    def _of_second(self, frames: mi.Float, curve: mi.UInt32, p: mi.Point3f) -> tuple[mi.Bool, mi.Point3f, mi.Vector3f]:
+        """Do rims coincide at points p? Where these are as the second shape moves, and the direction towards that."""
+        kind = dr.gather(mi.UInt32, self._other_kind, curve)
+        with dr.suspend_grad():
+            x, y, z, o = self._columns(frames, curve, 12, self._other_shape)
+            local = x * p.x + y * p.y + z * p.z + o
+        x, y, z, o = self._columns(frames, curve, 0, self._other_shape)
+        q = mi.Point3f(x * local.x + y * local.y + z * local.z + o)
+        with dr.suspend_grad():
+            upwards = dr.select(kind == int(CurveKind.TOP), -z, z)
+            other = dr.detach(dr.select(kind == int(CurveKind.RIM), o - p, upwards))
+        return self.joined(curve * PIECES), q, other
+
+    def joined(self, piece: mi.UInt32) -> mi.Bool:
+        """Is the piece on rims that coincide?"""
+        return dr.gather(mi.Bool, self._joined, piece // PIECES)
 
     def misses(self, frames: mi.Float, piece: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
         """Is the piece on a rim of a cylinder, beyond whose contour the ray goes?"""
@@ -160,9 +220,11 @@ class Curves:
         rim = (kind == int(CurveKind.BOTTOM)) | (kind == int(CurveKind.TOP))
         return rim & (dr.square(p.x * d.y - p.y * d.x) > dr.square(d.x) + dr.square(d.y))
 
-    def _columns(self, frames: mi.Float, curve: mi.UInt32, start: int) -> list[mi.Vector3f]:
-        """Images of the axes, and of the origin."""
-        first = dr.gather(mi.UInt32, self._shape, curve) * 24 + start
+    def _columns(
+        self, frames: mi.Float, curve: mi.UInt32, start: int, shapes: mi.UInt32 | None = None
+    ) -> list[mi.Vector3f]:
+        """Images of the axes, and of the origin. shapes : of all curves, unless it is the first one of each."""
+        first = dr.gather(mi.UInt32, self._shape if shapes is None else shapes, curve) * 24 + start
         return [mi.Vector3f(*(dr.gather(mi.Float, frames, first + 4 * i + j) for i in range(3))) for j in range(4)]
 
 

@@ -37,12 +37,14 @@ class Geometry:
         must not move.
     lines : in which shapes cut through each other (`CutCurves`, `Intersections`), whose vertices then come after those
         of the meshes.
+    joints : rims of analytic shapes that coincide (`Rims`).
     """
 
     meshes: tuple[Any, ...]
     analytic: tuple[Any, ...] = ()
     others: tuple[Any, ...] = ()
     lines: tuple[Any, ...] = ()
+    joints: tuple[Any, ...] = ()
 
     @staticmethod
     def of(scene: mi.Scene) -> Geometry:

@@ -22,6 +22,7 @@ from rimlight.edge_sampling import (
     IndirectShadows,
     Intersections,
     Lights,
+    Rims,
     ShadingBoundary,
     ShadowBoundary,
     Silhouettes,
@@ -74,6 +75,7 @@ class BoundarySearch:
         self._cracks = Cracks.none()
         self._instances = Instances()
         self._curves: CutCurves | None = None
+        self._rims: Rims | None = None
         self._lines: Intersections | None = None
         self._sources: Sources | None = None
         self._checked = False
@@ -133,12 +135,13 @@ class BoundarySearch:
         self._refuse_while_recording()
         refuse_timed_sky(scene, self.who)
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
-        self.geometry = self.edges = self._curves = self._lines = self._sources = self._partial = self._media = None
+        self.geometry = self.edges = self._curves = self._rims = self._lines = None
+        self._sources = self._partial = self._media = None
         self._boundaries, self._beyond, self._maps, self._bent = {}, {}, [], []
         collect_before()
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
-        self._curves = CutCurves(geometry)
+        self._curves, self._rims = CutCurves(geometry), Rims(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
         self.edges, self._cracks = close_cracks(geometry, self.edges, weld)
         self._sources = Sources(scene, found, geometry, self.edges, weld, self._cracks)
@@ -147,11 +150,12 @@ class BoundarySearch:
         self._bent = [(s, o) for s in surfaces(scene) for o in objects_below(s).values() if hasattr(o, "turns")]
 
     def _find_lines(self, scene: mi.Scene) -> None:
-        """Find the lines in which the shapes cut through each other now."""
-        changed = self._curves.find(self.geometry), self._lines.find(scene, self.geometry)
+        """Find the lines in which the shapes cut through each other now, and the rims that coincide."""
+        changed = self._curves.find(self.geometry), self._lines.find(scene, self.geometry), self._rims.find()
         if any(changed):
             lines = tuple(lines for lines in (self._curves, self._lines) if lines.capacity)
-            self.geometry, self._boundaries = replace(self.geometry, lines=lines), {}
+            self.geometry = replace(self.geometry, lines=lines, joints=self._rims.joints)
+            self._boundaries = {}
             collect_before()
 
     @property
