@@ -8,7 +8,7 @@ what the camera sees                  the film position: the *ray* is fixed on t
 every further vertex of a path        far from the vertex before: the *material point*, which follows its surface;
                                       close to it, or behind rough glass: the direction, so that the vertex
                                       slides over its surface
-a point on a lamp                     the material point
+a point on a lamp                     the material point; close to one of the `CloseLamps`, the direction
 one side of a boundary                as the interior term has the point that is seen there
 a point of a light without size       the light's own numbers: it goes where the light goes
 what is infinitely far away           the direction
@@ -21,7 +21,8 @@ moves together sees no motion at all.
 
 Where two surfaces meet and only one of x and y moves, the change of 1 / r² has no finite variance. So scattered light
 is divided: the part `far(r)` of what arrives from a point at the distance r is held at the material point, the rest in
-its direction. Both parts add up to the whole, so that the division may be chosen at will (`Vicinity`).
+its direction. Both parts add up to the whole, so that the division may be chosen at will (`Vicinity`). So is the light
+of lamps that are close to what they light (`close_lamps.py`).
 
 Through rough glass, a surface looks in few directions. Of a material point that moves out of them, the change relative
 to its value is large. So what rough glass shows is held in its direction, however far it is; but not where there are
@@ -30,7 +31,7 @@ interpolated normals: what slides over such a mesh jumps at the edges of its fac
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -221,6 +222,22 @@ class Connection:
     still: mi.Bool
     smooth: mi.Bool
     spread: mi.Float
+
+    def sliding(self, x: mi.SurfaceInteraction3f, d: mi.Vector3f, vicinity: Vicinity, active: mi.Bool) -> Connection:
+        """The same where y slides in the vicinity of x: a part is held at the material point, the rest in its direction
+        d, and both follow the change of this part along their own motion. Only ω and `geometry` are those of y as it
+        slides."""
+        between, n, d = self.y.p - x.p, dr.detach(self.y.n), dr.detach(d)
+        held = vicinity.far(dr.detach(dr.squared_norm(between)))
+        cosine = dr.dot(d, n)
+        active = active & ~self.still & (cosine != 0) & (held < 1)
+        # Along the ray, to the plane that moves with y.
+        along = dr.dot(between, n) / dr.select(active, cosine, 1)
+        near = 1 - vicinity.far(dr.square(along))
+        geometry = held * self.geometry + vicinity.far(dr.squared_norm(between)) + near
+        geometry = dr.replace_grad(self.geometry, dr.select(active, geometry, self.geometry))
+        ω = dr.replace_grad(self.ω, dr.select(active, dr.lerp(d, self.ω, held), self.ω))
+        return replace(self, ω=ω, geometry=geometry, smooth=self.smooth & (vicinity.radius == 0))
 
     def attach(self, weight: mi.Float, p: mi.Float, q: mi.Float, *, by_light: bool) -> mi.Float:
         """Attach a weight of multiple importance sampling where y is on one of the `SmoothLamps`.

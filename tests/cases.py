@@ -35,6 +35,7 @@ from joints import JOINTS
 from mirrors import MIRRORS, ball_of_index
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
+from touching_lamps import TOUCHING
 
 from rimlight.checks import FiniteDifferences, Motion, derivative_image, finite_differences
 
@@ -908,6 +909,10 @@ CASES = [
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096)
         for k, (*of, depth) in (CUTS | MIRRORS | BEAMS).items()
+    ),
+    *(
+        Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=1024)
+        for k, (*of, depth) in TOUCHING.items()
     ),
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k.endswith("_slides") else 1024)

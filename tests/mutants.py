@@ -93,7 +93,7 @@ MUTANTS = [
     mutant(
         "edges from points: velocity of what is seen left out",
         SHADING,
-        "(edge - beyond)",
+        "(edge - far * turning(n_dl, d, valid))",
         "edge",
     ),
     mutant(
@@ -178,8 +178,8 @@ MUTANTS = [
     mutant(
         "edges from points: not shared with the lights' samples",
         SHADING,
-        "L *= dr.select(shared, 1 - theirs, 1)",
-        "pass",
+        "ours = L * (1 - theirs)",
+        "ours = mi.Spectrum(L)",
     ),
     mutant(
         "interior: a lamp lights itself in its own plane",
@@ -293,7 +293,7 @@ MUTANTS = [
     ),
     mutant(
         "vicinity: its weight has no derivative",
-        SCATTERING,
+        PARAMETRISATION,
         "near = 1 - vicinity.far(dr.square(along))",
         "near = 1 - vicinity.far(dr.square(dr.detach(along)))",
     ),
@@ -302,6 +302,18 @@ MUTANTS = [
         "plugins/transport/paths.py",
         "turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))",
         "turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth < first))",
+    ),
+    mutant(
+        "close lamps: shadows that are found from them are those of their whole light",
+        SHADOWS,
+        "Le *= tracer.lamps.vicinity(light.emitter).far(r2)",
+        "Le *= 1",
+    ),
+    mutant(
+        "close lamps: their own outlines are no boundaries",
+        SHADING,
+        "L = self._radiance(tracer.scene, y, light, active & emission)",
+        "L = mi.Spectrum(0)",
     ),
     mutant(
         "vicinity: edges behind rough glass count on one side",
@@ -318,8 +330,8 @@ MUTANTS = [
     mutant(
         "edges from points: only what is seen past silhouettes counts",
         SHADING,
-        "return value + faces * edge if tracer.scatters(2) else value",
-        "return value",
+        "(edge - far * turning(n_dl, d, valid)) + faces * edge",
+        "(edge - far * turning(n_dl, d, valid))",
     ),
     # ---------------------- Channels besides light ----------------------
     mutant(

@@ -20,6 +20,7 @@ from rimlight.edge_sampling.geometry.texture_lines import lines_of_beam
 from .beam_lines import BeamLines
 from .indirect_shadows import IndirectShadows
 from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow
+from .tracer import Tracer
 
 #: How far beside a line its sides are looked at, in units in the last place of the place on the picture.
 BESIDE_LINE = 64
@@ -73,11 +74,11 @@ class IndirectBeams(IndirectShadows):
     # ---------------------- What arrives where it falls ----------------------
 
     def _arriving(
-        self, scene: mi.Scene, light: LightPoint, edge: LitEdge, shadow: Shadow, view: SeenShadow, share
+        self, tracer: Tracer, light: LightPoint, edge: LitEdge, shadow: Shadow, view: SeenShadow, share
     ) -> tuple[None, mi.Spectrum, mi.Bool]:
         si = view.si
         f = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(-edge.ω), view.active)
-        jump = self._difference(scene, light, edge, shadow, si.wavelengths, view.active)
+        jump = self._difference(tracer.scene, light, edge, shadow, si.wavelengths, view.active)
         return None, dr.select(view.active, f * jump * view.weight, 0), view.active
 
     def _difference(self, scene: mi.Scene, light, edge: LitEdge, shadow: Shadow, wavelengths, active) -> mi.Spectrum:

@@ -110,7 +110,7 @@ class IndirectShadows(ShadowBoundary):
                 back = density_onwards(x, edge.ω, z, join)
                 later = (point.depth > 1) & dr.isfinite(point.density)
                 join.weight *= dr.select(later, power_heuristic(point.density, back), 1)
-            view, met, jump, n_dl = self._boundary(scene, light, edge, shadow, x, z, join)
+            view, met, jump, n_dl = self._boundary(tracer, light, edge, shadow, x, z, join)
             far = point.vicinity.around(z.bsdf()).far(join.r2)
         with dr.resume_grad():
             m = material_point(shadow.ray, shadow.fallen, view.active).p
@@ -145,7 +145,7 @@ class IndirectShadows(ShadowBoundary):
             join.weight *= to_z.weight * (power_heuristic(back, to_z.pdf) / back)
             join.active &= back > 0
             join.weight = dr.select(join.active, join.weight, 0)
-            view, met, jump, n_dl = self._boundary(scene, light, edge, shadow, x, z, join)
+            view, met, jump, n_dl = self._boundary(tracer, light, edge, shadow, x, z, join)
             far_z = point.vicinity.around(w.bsdf()).far(to_z.r2)
             far = point.vicinity.around(z.bsdf()).far(join.r2)
         with dr.resume_grad():
@@ -155,7 +155,7 @@ class IndirectShadows(ShadowBoundary):
             held = _held(p_z, m, x.n, join.ω, far, active)
             return self._value(scene, placement, light, edge, shadow, met, m, held, jump, n_dl, active)
 
-    def _boundary(self, scene, light, edge, shadow, x, z, join: _Join):
+    def _boundary(self, tracer: Tracer, light, edge, shadow, x, z, join: _Join):
         """The shadow as z sees it; what the ray to the light meets; the jump; and the normal of the curve, with its
         length element over the density, away from the lit side."""
         near, whole = dr.norm(edge.p - x.p), dr.norm(light.y - x.p)
@@ -164,7 +164,7 @@ class IndirectShadows(ShadowBoundary):
         x.wavelengths = ray.wavelengths = z.wavelengths
         x.wi = x.to_local(-join.ω)
         view = SeenShadow(mi.Point2f(0), ray, join.weight, shadow.fallen, x, None, join.active)
-        met, jump, view.active = self._arriving(scene, light, edge, shadow, view, ours)
+        met, jump, view.active = self._arriving(tracer, light, edge, shadow, view, ours)
         tangent, towards_light = (thrown(v, light, edge, shadow) for v in (edge.tangent, edge.lit))
         n_dl = dr.cross(shadow.facing, tangent) * (len(self) / edge.sample.density)
         n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))

@@ -9,7 +9,7 @@ derivative of L gains
 with ω = (e(t) − x) / r. ω̇_side is the velocity of what the interior derivative holds fixed on that side: the *material
 point* that is seen there. A face that ends at the edge moves as the edge does, and contributes nothing: so neither do
 creases, nor the outlines of lights by their own motion. What is left is what is seen past a silhouette, on the side
-where its faces are not.
+where its faces are not. Only in the vicinity of x, and of `CloseLamps`, directions are held: there, both sides count.
 
 Edges are found by a descent of the edge tree, for emitted light within the cone of directions to one light; of a few
 edges one is kept. Emitted light whose shadows are found from the lights as well (`shadow_boundary.py`), which alone
@@ -92,7 +92,7 @@ class ShadingBoundary:
         #: Emitters of several lights (see `Lights`): only their background counts.
         self.several = [e for e in emitters if hasattr(e, "light_count")]
         #: Is emitted light sought at points that the camera sees, too? For diffuse surfaces `ShadowBoundary` is enough,
-        #: except for the light of environments.
+        #: except for the light of environments, and near `CloseLamps`.
         self.emission_at_first = any(self._counts_at_first(emitters[i]) for i in lights)
 
     def _counts_at_first(self, emitter: mi.Emitter) -> bool:
@@ -130,12 +130,16 @@ class ShadingBoundary:
 
             # ---------------------- Emitted light, or scattered ----------------------
 
-            emission = active & ((point.depth != 1) | self.emission_at_first) & self.emission
+            at_first = self.emission_at_first or tracer.lamps is not None
+            emission = active & ((point.depth != 1) | at_first) & self.emission
             scattering = active & tracer.scatters(point.depth + 1) & tracer.scatters(2)
             facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
-            light, p_light = self._choose(tracer, si.p, facing, sampler, emission)
-            cone = self.boxes.cone(light, si.p)
-            light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), light, emission)
+            number, p_light = self._choose(tracer, si.p, facing, sampler, emission)
+            cone = self.boxes.cone(number, si.p)
+            light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), number, emission)
+            to_lamp = Vicinity(mi.Float(0)) if tracer.lamps is None else tracer.lamps.vicinity(light)
+            if not self.emission_at_first:
+                emission &= (point.depth != 1) | (self.boxes.distance(number, si.p) < to_lamp.radius)
 
             # ---------------------- An edge ----------------------
 
@@ -152,11 +156,11 @@ class ShadingBoundary:
                 """An edge for emitted light, which is sought in the directions of one light; or for scattered light,
                 which is sought everywhere, and where both sides of edges close by count. And about what it contributes
                 if nothing hides it."""
-                vicinity = Vicinity(dr.select(emitted, 0, radius))
+                vicinity = Vicinity(dr.select(emitted, to_lamp.radius, radius))
                 towards = replace(
                     view,
                     cone=Cone(cone.axis, dr.select(emitted, cone.cos, -1), cone.sin),
-                    vicinity=vicinity if tracer.scatters(2) else None,
+                    vicinity=vicinity if tracer.scatters(2) or tracer.lamps is not None else None,
                 )
                 # What is seen past an edge that stands still may move. What emits does not: else all would be in one
                 # group.
@@ -176,7 +180,7 @@ class ShadingBoundary:
 
             e, emission = _chosen(candidate, choice, emission, scattering, sampler)
             e.density *= dr.select(emission, p_light, 1)
-            vicinity = Vicinity(dr.select(emission, 0, radius))
+            vicinity = Vicinity(dr.select(emission, to_lamp.radius, radius))
         return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, vicinity)
 
     @staticmethod
@@ -225,7 +229,7 @@ class ShadingBoundary:
         """What a point on an edge does to the light that is reflected.
 
         light : the only one whose emission counts. emission : does emitted light count, or scattered light?
-        vicinity : within which the directions are held, in which scattered light arrives.
+        vicinity : within which the directions are held, in which this light arrives.
         """
         scene, si = tracer.scene, point.si
         with dr.suspend_grad():
@@ -252,16 +256,15 @@ class ShadingBoundary:
             def see(side, active, slack=1):
                 return look(scene, si, x, p, outline, side * aside * across, slack * aside, distance, active)
 
-            side = dr.select(outward != 0, outward, 1)
+            past, side = outward != 0, dr.select(outward != 0, outward, 1)
             ray, pi, y, hidden, own = see(side, active)
-            past = outward != 0
             active &= ~hidden & (past | own)
-            L = self._emitted(scene, point, y, ω, pdf, distance, active & past & emission, light, ~outline.is_line)
+            shines = active & emission & (past | (near > 0))
+            L, from_lamp = self._emitted(scene, point, y, ω, pdf, distance, shines, light, past & ~outline.is_line)
             valid = active & y.is_valid()
+            again, lune, faces = sampler.clone(), None, mi.Spectrum(0)
             if tracer.scatters(2):
-                again = sampler.clone()
-                reflected = valid & ~emission
-                beside, lune = None, None
+                reflected, beside = valid & ~emission, None
                 if self.smooth:
                     # Where only the planes of its faces hide something, light comes from between them.
                     beside = ~past
@@ -270,16 +273,14 @@ class ShadingBoundary:
                 found = _found_from_points(point, p, y, ω, past & ~outline.is_line)
                 scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune, found)
                 L += dr.select(reflected, scattered, 0)
+            if tracer.scatters(2) or tracer.lamps is not None:
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
-                of_faces = active & ~emission & (near > 0) & ~outline.is_line
-                other_ray, other_pi, _, hidden, own = see(-side, of_faces, slack=2)
-                reflected = of_faces & ~hidden & own
-                beside = reflected if self.smooth else None
-                other_L = tracer.scattered(other_ray, other_pi, point.depth, again, reflected, beside, lune)
+                seen = see(-side, active & (near > 0) & ~outline.is_line, slack=2)
+                other_L, of_faces = self._shown_by_faces(tracer, point, *seen, again, light, emission, lune)
                 # What its own faces show, held in its direction in the vicinity.
-                faces = dr.select(reflected, other_L - dr.select(past, 0, L), 0)
+                faces = dr.select(of_faces, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)
-            L = dr.select(active & past, f * L, 0)
+            L, from_lamp = (dr.select(active & past, f * light, 0) for light in (L, from_lamp))
             n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
@@ -287,9 +288,25 @@ class ShadingBoundary:
             x = si.p + lift
             edge = turning(n_dl, p - x, active)
             d = material_point(ray, pi, valid).p - x
-            beyond = vicinity.far(dr.detach(dr.squared_norm(d))) * turning(n_dl, d, valid)
-            value = -side * L * (edge - beyond)
-            return value + faces * edge if tracer.scatters(2) else value
+            far = vicinity.far(dr.detach(dr.squared_norm(d)))
+            value = -side * L * (edge - far * turning(n_dl, d, valid)) + faces * edge
+            if tracer.lamps is not None:
+                # From lamps, only the part is found that is held at their points.
+                value -= side * from_lamp * dr.select(valid, 1 - far, 0) * edge
+            return value
+
+    def _shown_by_faces(
+        self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune
+    ) -> tuple[mi.Spectrum, mi.Bool]:
+        """What arrives along a ray that `look` has made, from a surface on which the edge lies; and does it?"""
+        active = pi.is_valid() & ~hidden & own
+        L = self._radiance(tracer.scene, y, light, active & emission)
+        if tracer.scatters(2):
+            reflected = active & ~emission
+            beside = reflected if self.smooth else None
+            scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune)
+            L += dr.select(reflected, scattered, 0)
+        return L, active
 
     def _outward(self, outline, across, ω, n_dl, sampler, active) -> tuple[mi.Float, mi.Vector3f]:
         """The side of an edge on which its faces are not, 1 or −1 along `across`; 0 if they are on both. And `n_dl`,
@@ -304,18 +321,15 @@ class ShadingBoundary:
 
     def _emitted(
         self, scene, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
-    ) -> mi.Spectrum:
-        """Light that one light emits at y towards a point. pdf : density of ω among samples of the BSDF there.
-        distance : of the edge. found_too : may the edge throw a shadow that is found from the light?"""
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """Light that one light emits at y towards a point: the part of which shadows are found from the point; and the
+        part of which they are found from the light, if that is a material point. pdf : density of ω among samples of
+        the BSDF there. distance : of the edge. found_too : may the edge throw a shadow that is found from the light?"""
         if not self.emission:
-            return mi.Spectrum(0)
+            return mi.Spectrum(0), mi.Spectrum(0)
         si, at_first = point.si, point.depth == 1
-        emitter = y.emitter(scene, active)
+        L, emitter = self._radiance(scene, y, light, active), y.emitter(scene, active)
         lit = active & (emitter == light)
-        L = emitter.eval(y, lit)
-        for several in self.several:
-            mine = lit & (emitter == mi.EmitterPtr(several))
-            L = dr.select(mine, several.eval_background(y, mine), L)
         # Shadows that are found from the lights, too; all of those on what the sensor sees.
         shared = lit & found_too & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
         for lamp in self.bent_lamps:
@@ -324,10 +338,23 @@ class ShadingBoundary:
         light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared | on_smooth)
         mis = power_heuristic(pdf, light_pdf)
         part = share(point.density, light_pdf, pdf, dr.abs_dot(si.n, ω), distance, y.t)
-        theirs = dr.select(at_first, 1 - mis, part)
-        L *= dr.select(shared, 1 - theirs, 1)
+        theirs = dr.select(at_first, 1 - mis if self.emission_at_first else 1, part)
+        theirs = dr.select(shared, theirs, 0)
+        ours = L * (1 - theirs)
         if len(self.smooth_lamps):
-            L *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
+            ours *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
+        return ours, L * theirs
+
+    def _radiance(self, scene: mi.Scene, y: mi.SurfaceInteraction3f, light: mi.EmitterPtr, active) -> mi.Spectrum:
+        """What one light emits at y."""
+        if not self.emission:
+            return mi.Spectrum(0)
+        emitter = y.emitter(scene, active)
+        lit = active & (emitter == light)
+        L = emitter.eval(y, lit)
+        for several in self.several:
+            mine = lit & (emitter == mi.EmitterPtr(several))
+            L = dr.select(mine, several.eval_background(y, mine), L)
         return L
 
 

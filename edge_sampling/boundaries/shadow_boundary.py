@@ -10,7 +10,8 @@ The derivative for the whole light is the mean over its points. Where the light 
 all there is (Li et al. 2018 leave such lights out); where it has a size, the same boundary can be found from the
 shading points (`shading_boundary.py`), and what both find is divided between them.
 
-The point of the light is a *material point*, as it is for the interior derivative: it moves with the light.
+The point of the light is a *material point*, as it is for the interior derivative: it moves with the light. Of the
+light of `CloseLamps`, this is the part that is held at the material point; the rest is found from the shading points.
 """
 
 from __future__ import annotations
@@ -120,9 +121,7 @@ class ShadowBoundary:
             edge = self._edge(placement, light, sampler)
             shadow = fall(tracer.scene, light, edge)
             view = _look(tracer, projection, sensor, sampler, light.time, shadow)
-            met, jump, active = self._arriving(
-                tracer.scene, light, edge, shadow, view, power_heuristic if share else None
-            )
+            met, jump, active = self._arriving(tracer, light, edge, shadow, view, power_heuristic if share else None)
 
             # ---------------------- The boundary on the film ----------------------
 
@@ -243,7 +242,7 @@ class ShadowBoundary:
 
     def _arriving(
         self,
-        scene: mi.Scene,
+        tracer: Tracer,
         light: LightPoint,
         edge: LitEdge,
         shadow: Shadow,
@@ -256,7 +255,7 @@ class ShadowBoundary:
         share : given the densities of the direction to a lamp, among light samples and those of the BSDF: which part of
             its shadow is found so; None: all.
         """
-        si, y, n, on_surface = view.si, light.y, light.n, light.on_surface
+        scene, si, y, n, on_surface = tracer.scene, view.si, light.y, light.n, light.on_surface
         # From x to the edge, nothing is in the way: that has been seen already.
         onwards = shadow.onwards
         onwards.wavelengths = view.ray.wavelengths
@@ -286,7 +285,11 @@ class ShadowBoundary:
                 mis = (share or power_heuristic)(light_pdf, pdf)
             if len(self.smooth_lamps) and not share:
                 cos, mis = self.smooth_lamps.cosine(on_light, ω_x, mis), 1
-            Le = light.emitter.eval(on_light, emitting) * (cos / dr.squared_norm(to_light))
+            r2 = dr.squared_norm(to_light)
+            Le = light.emitter.eval(on_light, emitting) * (cos / r2)
+            if tracer.lamps is not None:
+                # Only the part of its light that is held at the point of the lamp.
+                Le *= tracer.lamps.vicinity(light.emitter).far(r2)
             L = dr.select(on_surface, Le * mis, L)
         return met, dr.select(active, f * L * view.weight, 0), active
 

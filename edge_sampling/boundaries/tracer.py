@@ -8,6 +8,7 @@ from typing import Protocol
 import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
+from rimlight.edge_sampling.close_lamps import CloseLamps
 from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .crease import Directions
@@ -42,11 +43,13 @@ class Tracer(Protocol):
 
     scene : mi.Scene
     lights : chooses one of many lights; None: all are equally likely.
+    lamps : those whose light is held in its direction near them; None: there are none.
     shares_directions : may it be told in which directions to look for the light that a crease reflects?
     """
 
     scene: mi.Scene
     lights: LightChoice | None
+    lamps: CloseLamps | None
     shares_directions: bool
 
     def scatters(self, depth: mi.UInt32 | int) -> mi.Bool | bool:

@@ -72,6 +72,11 @@ class EmitterBoxes:
             dr.scatter_reduce(dr.ReduceOp.Min, self.lower, p[k], 3 * self._emitter + k)
             dr.scatter_reduce(dr.ReduceOp.Max, self.upper, p[k], 3 * self._emitter + k)
 
+    def distance(self, emitter: mi.UInt32, x: mi.Point3f) -> mi.Float:
+        """How far emitters are from x, at least."""
+        lower, upper = (dr.gather(mi.Point3f, bounds, emitter) for bounds in (self.lower, self.upper))
+        return dr.norm(dr.maximum(dr.maximum(lower - x, x - upper), 0))
+
     def cone(self, emitter: mi.UInt32, x: mi.Point3f) -> Cone:
         """The directions in which emitters may be seen from x, world space."""
         lower, upper = (dr.gather(mi.Point3f, bounds, emitter) for bounds in (self.lower, self.upper))

@@ -36,6 +36,7 @@ from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.choice.light_choice import LightChoice
+from rimlight.edge_sampling.close_lamps import CloseLamps
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
 from rimlight.edge_sampling.geometry.meshes import inner, surfaces
@@ -223,7 +224,7 @@ class BoundarySearch:
         film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft) if on_film.any() else None
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
-        shadows, shading, indirect = self._in_reflected_light(scene, moving, sppi)
+        shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi)
         abilities = {"planes": self.planes, "from_points": self.from_points}
         deep = None
         if shading is not None and self.from_surfaces and self.depths.scatters(3):
@@ -239,7 +240,7 @@ class BoundarySearch:
         shown = shown if shown is not None and len(shown) else None
         chains = (*mirrors, textures, shown, Surfaces(scene) if mirrors[0] or textures else None)
         lights = LightChoice.of(scene)
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights, deep)
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights, deep, lamps)
 
     @staticmethod
     def _texture_lines(scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
@@ -251,23 +252,26 @@ class BoundarySearch:
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int
-    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, tuple[IndirectShadows, ...]]:
-        """What samples the edges of which lights and shading points know, as far as it is needed."""
+    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, tuple[IndirectShadows, ...], CloseLamps | None]:
+        """What samples the edges of which lights and shading points know, as far as it is needed; and the lamps near
+        which points know of all edges."""
         if not sppi or not scene.emitters() or not self.depths.scatters(1):
-            return None, None, ()
+            return None, None, (), None
         everything = moving.camera or moving.lights
         silhouettes = Silhouettes(self.geometry, self._edges_and_lines, None if everything else moving.flags)
         if not len(silhouettes):
-            return None, None, ()
-        shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, ()
+            return None, None, (), None
+        shadows, shading, indirect, lamps = ShadowBoundary(scene, silhouettes), None, (), None
         if self.from_points:
             shapes = None if everything else list(moving.shapes)
             shading = ShadingBoundary(scene, silhouettes, shapes)
-            shading = shading if self.depths.scatters(2) or shading.emission_at_first else None
+            lamps = None if self.geometry.others else CloseLamps.of(scene)
+            needed = self.depths.scatters(2) or shading.emission_at_first or lamps is not None
+            shading = shading if needed else None
             kinds = (IndirectShadows, IndirectBeams) if self.depths.scatters(2) else ()
             found = [kind(scene, silhouettes, shapes, hidden=self.from_surfaces) for kind in kinds]
             indirect = tuple(f for f in found if len(f))
-        return shadows if len(shadows) else None, shading, indirect
+        return shadows if len(shadows) else None, shading, indirect, lamps
 
     def _face_planes(self, scene: mi.Scene, moving: Moving) -> FacePlanes | None:
         """What samples the planes of faces, if what they hide can change: where the faces move, or what lights them.

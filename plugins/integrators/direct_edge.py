@@ -40,7 +40,7 @@ class DirectEdgeIntegrator(EdgeIntegrator):
 
     The interior derivative holds the film position of a camera ray, and the *material point* of a light sample: a
     light that moves takes its samples along (as in path-space differentiation, Zhang et al. 2020). So it needs no
-    boundary unless something occludes it.
+    boundary unless something occludes it, or it touches what it lights.
 
     **Limits.** Only triangle meshes and their instances, spheres, disks and cylinders can move: moving hair is refused,
     and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and

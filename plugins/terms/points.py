@@ -59,7 +59,9 @@ class PointsTerm(FromPoints):
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0
-        why = "light that is scattered may be occluded" if job.segments > 2 else "glossy surfaces, or an environment"
+        why = "light that is scattered may be occluded"
+        if job.segments <= 2:
+            why = "glossy surfaces, an environment, or lamps close to what they light"
         from_lights = job.boundaries.shadows is not None
         why_not = "direct light: found from the lights" if from_lights else nothing_at_points(job)
         return self.plan(count, 1 + job.rays_of_path, why, why_not)

@@ -225,7 +225,8 @@ class BidirectionalTracer(PathTracer):
         camera, light = Part(found.camera, lane, way.scatters), Part(found.light, subpath, number)
         end = dr.select(way.connected, start, way.end)
         L = found.from_camera.standing_for_all
-        return WholePaths(self.scene, camera, light, end, L, ray, found.pi, way.sampled, self.glass, self.around)
+        held = self.glass, self.lamps
+        return WholePaths(self.scene, camera, light, end, L, ray, found.pi, way.sampled, *held, self.around)
 
     def light_paths_seen(self, found: FoundPaths, ray: mi.RayDifferential3f) -> WholePaths:
         """What the sensor sees of light subpaths. ray : the camera rays there, attached to the camera."""
@@ -237,4 +238,5 @@ class BidirectionalTracer(PathTracer):
         no = mi.Bool(False)
         nothing = Part(found.camera, mi.UInt32(0), dr.zeros(mi.UInt32, dr.width(lane)))
         light = Part(found.light, lane, seen.number)
-        return WholePaths(self.scene, nothing, light, found.ends, L, ray, pi, no, self.glass, self.around)
+        held = self.glass, self.lamps
+        return WholePaths(self.scene, nothing, light, found.ends, L, ray, pi, no, *held, self.around)

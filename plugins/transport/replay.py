@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
+from rimlight.edge_sampling.close_lamps import CloseLamps
 from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
 from rimlight.edge_sampling.refusals import Refusal
 
@@ -43,11 +44,17 @@ class Chain:
     """The vertices of paths behind the first, as they move.
 
     vicinity : in which they slide.
-    lights : see `Scattering`.
+    lights, lamps : see `Scattering`.
     """
 
-    def __init__(self, scene: mi.Scene, vicinity: Vicinity, lights: LightChoice | None = None):
-        self.scattering = Scattering(scene, attached=True, lights=lights)
+    def __init__(
+        self,
+        scene: mi.Scene,
+        vicinity: Vicinity,
+        lights: LightChoice | None = None,
+        lamps: CloseLamps | None = None,
+    ):
+        self.scattering = Scattering(scene, attached=True, lights=lights, lamps=lamps)
         self.vicinity = vicinity
 
     def surface(self, vertex: Vertex, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -110,9 +117,10 @@ class Replay:
         depths: Depths,
         active: mi.Bool,
         lights: LightChoice | None = None,
+        lamps: CloseLamps | None = None,
     ):
         self.scene, self.sampler, self.vertex, self.start, self.depths = scene, sampler, vertex, start, depths
-        self.chain = Chain(scene, vicinity, lights)
+        self.chain = Chain(scene, vicinity, lights, lamps)
         self.active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
 
     def forward(self, start: Start) -> mi.Spectrum:

@@ -10,6 +10,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
+from rimlight.edge_sampling.close_lamps import CloseLamps
 from rimlight.edge_sampling.geometry.meshes import objects_below, surfaces
 from rimlight.edge_sampling.parametrisation import Connection, Parametrisation, Vicinity, shown_by_mirror
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to_light
@@ -52,7 +53,8 @@ class Numbers:
 class Scattering:
     """Direct illumination by multiple importance sampling, and the next vertex of a path.
 
-    Of a light sample, the *material point* y is held fixed, and of every next vertex (`parametrisation.py`). The
+    Of a light sample, the *material point* y is held fixed, and of every next vertex (`parametrisation.py`), as far as
+    they are not close. The
     estimate of a light sample is
 
         f(ω) |cos θ_x| Lₑ(y, −ω) · |cos θ_y| dA / r²  /  p(ω),      ω = (y − x) / r,
@@ -63,10 +65,18 @@ class Scattering:
 
     attached : carry gradients? Otherwise values only.
     lights : chooses one of many lights; None: Mitsuba does.
+    lamps : whose light is held in its direction near them.
     """
 
-    def __init__(self, scene: mi.Scene, *, attached: bool, lights: LightChoice | None = None):
-        self.scene, self.lights = scene, lights
+    def __init__(
+        self,
+        scene: mi.Scene,
+        *,
+        attached: bool,
+        lights: LightChoice | None = None,
+        lamps: CloseLamps | None = None,
+    ):
+        self.scene, self.lights, self.lamps = scene, lights, lamps
         self.attached = attached
         flags = [e.flags() for e in scene.emitters()]
         self.any = bool(flags)
@@ -203,6 +213,8 @@ class Scattering:
         visible = dr.select(on_surface, pi.is_valid() & (pi.t >= before), ~pi.is_valid())
         with dr.resume_grad():
             to_lamp = self.held.connect(si, pi, ray, on_surface & visible, by_light=True)
+            if self.lamps is not None:
+                to_lamp = self._to_lamp(si, ray, to_lamp, on_surface & visible)
             y = to_lamp.y
             direction = dr.select(on_surface, to_lamp.ω, ds.d)
             # Lights at infinity: the direction is fixed.
@@ -294,35 +306,28 @@ class Scattering:
         rough: mi.Bool,
     ) -> tuple[Connection, mi.Vector3f, mi.Spectrum, mi.Spectrum]:
         """What joins `si` to the surface that a ray from there meets, the direction to it, and the light scattered from
-        there over a density: if it is a material point, and as it moves in the vicinity.
+        there over a density: if it is a point of a lamp, and as it moves in the vicinity.
 
         rough : mi.Bool, is the BSDF evaluated? Else all of this is zero.
         """
         on_surface = active & pi.is_valid()
-        to_y = self.held.connect(si, pi, ray, on_surface, by_light=False)
-        ω = dr.select(on_surface, to_y.ω, ray.d)
-        f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active & rough)
-        attached = f * (dr.select(on_surface, to_y.geometry, 1) / pdf)
-        attached = dr.select(to_y.still, dr.detach(attached), attached)
-        if vicinity is None:
-            return to_y, ω, attached, attached
-        around = vicinity.around(bsdf)
-        return to_y, ω, attached, self._slide(si, bsdf, pdf, ray, to_y, attached, around, on_surface & rough)
+        to_y = to_lamp = self.held.connect(si, pi, ray, on_surface, by_light=False)
+        if self.lamps is not None:
+            to_lamp = self._to_lamp(si, ray, to_y, on_surface)
+        joined, weights = [to_lamp], []
+        if vicinity is not None:
+            joined.append(to_y.sliding(si, ray.d, vicinity.around(bsdf), on_surface & rough))
+        for to in joined:
+            ω = dr.select(on_surface, to.ω, ray.d)
+            f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active & rough)
+            f *= dr.select(on_surface, to.geometry, 1) / pdf
+            weights.append(dr.select(to.still, dr.detach(f), f))
+        return to_lamp, dr.select(on_surface, to_lamp.ω, ray.d), weights[0], weights[-1]
 
-    @staticmethod
-    def _slide(si, bsdf, pdf, ray, to_y, at_material, vicinity: Vicinity, active) -> mi.Spectrum:
-        """Throughput to a point that slides in the vicinity: `at_material`, with its part of the motion, and what is
-        held in its direction, with the rest."""
-        d = to_y.y.p - si.p
-        n = dr.detach(to_y.y.n)
-        cosine = dr.dot(ray.d, n)
-        active = active & ~to_y.still & (cosine != 0) & (vicinity.far(dr.detach(dr.squared_norm(d))) < 1)
-        # Along the ray, to the plane that moves with y.
-        along = dr.dot(d, n) / dr.select(active, cosine, 1)
-        at_direction = bsdf.eval(mi.BSDFContext(), si, si.to_local(ray.d), active) / pdf
-        near = 1 - vicinity.far(dr.square(along))
-        total = vicinity.far(dr.squared_norm(d)) * at_material + near * at_direction
-        return dr.select(active, total, at_material)
+    def _to_lamp(self, si, ray, to_y: Connection, active) -> Connection:
+        """What joins `si` to a point of a lamp, which slides near `CloseLamps`."""
+        emitter = to_y.y.emitter(self.scene, active)
+        return to_y.sliding(si, ray.d, self.lamps.vicinity(emitter), active)
 
     def stops(self, ray, pi, sampler, active) -> mi.Bool:
         """Does a ray meet a surface that it does not go through as if nothing was there?"""

@@ -12,6 +12,7 @@ from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.light_choice import LightChoice
+from rimlight.edge_sampling.close_lamps import CloseLamps
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
 from rimlight.edge_sampling.rays import spawn_ray
 
@@ -46,6 +47,7 @@ class PathTracer:
 
     #: See `Scattering`.
     lights: LightChoice | None = None
+    lamps: CloseLamps | None = None
 
     #: See `rimlight.edge_sampling.boundaries.tracer.Tracer`.
     shares_directions = True
@@ -100,7 +102,7 @@ class PathTracer:
         bsdf = si.bsdf(ray)
         backdrop = active & (scene.environment() is not None and not self.hide_emitters)
         active &= si.is_valid()
-        scattering = Scattering(scene, attached=attached, lights=self.lights)
+        scattering = Scattering(scene, attached=attached, lights=self.lights, lamps=self.lamps)
         if not self.scatters(1):
             return Radiance(L, backdrop | scattering.stops(ray, pi, sampler, active))
 
@@ -122,7 +124,8 @@ class PathTracer:
         if attached:
             with dr.resume_grad():
                 start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight))
-            return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, self.lights))
+            chosen = self.lights, self.lamps
+            return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, *chosen))
         indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, lights=self.lights)
         return Radiance(L + dr.select(β != 0, indirect, 0), valid | (onwards.through & stopped))
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.close_lamps import CloseLamps
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera, shown_by_mirror
 from rimlight.edge_sampling.rays import lift, spawn_ray
 
@@ -52,7 +53,7 @@ class WholePaths:
     ray : camera ray, attached to the camera.
     seen : what the ray meets: the first vertex; or the light, if nothing scatters on the way.
     joined : mi.Bool, is the last vertex joined with a point that was sampled on a light?
-    glass : see `Vicinity`. around : the scene.
+    glass : see `Vicinity`. lamps : see `Scattering`. around : the scene.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class WholePaths:
         seen: mi.PreliminaryIntersection3f,
         joined: mi.Bool,
         glass: bool,
+        lamps: CloseLamps | None,
         around: Around,
     ):
         self.joined = joined
@@ -74,7 +76,7 @@ class WholePaths:
         self.n = camera.count + light.count
         self.radius = around.radius
         self.seen = mi.PreliminaryIntersection3f(seen)
-        self.chain = Chain(scene, Vicinity.of(seen, glass))
+        self.chain = Chain(scene, Vicinity.of(seen, glass), lamps=lamps)
         self.scattering = self.chain.scattering
         self.delta = mi.has_flag(end.emitter.flags(), mi.EmitterFlags.Delta)
         self.L = L

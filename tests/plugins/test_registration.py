@@ -224,6 +224,7 @@ ROOMS = (
     "rimlight.edge_sampling.lights",
     "rimlight.edge_sampling.smooth_lamps",
     "rimlight.edge_sampling.parametrisation",
+    "rimlight.edge_sampling.close_lamps",
     "rimlight.edge_sampling.choice",
     "rimlight.edge_sampling.boundaries",
     "rimlight.transport",

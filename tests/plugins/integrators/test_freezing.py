@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import random_scenes
+import touching_lamps
 from frozen import (
     Step,
     assert_frozen_is_unfrozen,
@@ -39,6 +40,9 @@ VALUES = [
     ("picture", "sensor.to_world"),
     ("sphere", "thing.to_world"),
     ("torus", "torus.vertex_positions"),
+    ("strip", "left.vertex_positions"),
+    ("window", "sensor.to_world"),
+    ("bulb", "ball.to_world"),
 ]
 SCENES = {
     "two_triangles": cases.two_triangles,
@@ -48,6 +52,9 @@ SCENES = {
     "picture": beams.on_cube(lambda: {**beams.picture(), "scale": 100.0}),
     "sphere": cases.sphere_over(cases.sun, cases.ceiling_light),
     "torus": cases.torus_in_the_sun,
+    "strip": touching_lamps.strip,
+    "window": touching_lamps.window,
+    "bulb": touching_lamps.bulb,
     "fisheye": cases.room(cases.fisheye),
     "batch": cases.room(cases.batch),
 }
