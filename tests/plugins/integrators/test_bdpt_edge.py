@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import rooms
+import touching_lamps
 from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, derivative_image
@@ -134,7 +135,14 @@ def test_image_is_that_of_bdpt():
     assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize(("scene", "key"), [(cases.room(), "light.to_world"), (cases.cube(), "cube.vertex_positions")])
+@pytest.mark.parametrize(
+    ("scene", "key"),
+    [
+        (cases.room(), "light.to_world"),
+        (cases.cube(), "cube.vertex_positions"),
+        (touching_lamps.window, "sensor.to_world"),
+    ],
+)
 def test_frozen(scene, key):
     """Where the scene grows with what moves, too."""
     assert_frozen_is_unfrozen(scene(), mi.load_dict({"type": "bdpt_edge", "max_depth": 4}), key)
