@@ -57,6 +57,7 @@ PARAMETRISATION = "edge_sampling/parametrisation.py"
 FILM = "edge_sampling/boundaries/film_boundary.py"
 SHADOWS = "edge_sampling/boundaries/shadow_boundary.py"
 SHADING = "edge_sampling/boundaries/shading_boundary.py"
+SILHOUETTES = "edge_sampling/choice/silhouettes.py"
 INDIRECT = "edge_sampling/boundaries/indirect_shadows.py"
 REPLAY = "plugins/transport/replay.py"
 
@@ -302,6 +303,12 @@ MUTANTS = [
         "plugins/transport/paths.py",
         "turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))",
         "turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth < first))",
+    ),
+    mutant(
+        "edges on surfaces: lines in which shapes cut through each other count on one side only",
+        SILHOUETTES,
+        "& ~self.slides & ~self.is_line",
+        "& ~self.slides",
     ),
     mutant(
         "close lamps: shadows that are found from them are those of their whole light",

@@ -73,12 +73,13 @@ class OutlinePoint:
         return dr.select(faces[0] != faces[1], -dr.sign(inwards), 0)
 
     def is_behind(self, n: mi.Vector3f, ω: mi.Vector3f) -> mi.Bool:
-        """Do its faces lie behind a surface in which the point is? Then that hides the edge.
+        """Do its faces lie behind a surface in which the point is? Then that hides the edge. Where shapes cut through
+        each other, both go on in front of it.
 
         n : normal of the surface. ω : from the viewer; both of unit length.
         """
         rises = [dr.mulsign(dr.dot(v, n), dr.dot(n, ω)) > RISES * dr.norm(v) for v in self.inwards]
-        return rises[0] & rises[1] & ~self.slides
+        return rises[0] & rises[1] & ~self.slides & ~self.is_line
 
 
 class Silhouettes:
