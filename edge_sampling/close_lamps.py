@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .emitter_table import EmitterTable
 from .geometry.meshes import is_smooth
 from .parametrisation import Vicinity
 
@@ -33,7 +34,7 @@ class CloseLamps:
     close later are none of them, which costs noise, but no bias.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("first", "radii"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("radii",))  # for `dr.freeze`
 
     @staticmethod
     def of(scene: mi.Scene) -> CloseLamps | None:
@@ -47,21 +48,11 @@ class CloseLamps:
         return CloseLamps(radii) if radii else None
 
     def __init__(self, radii: dict[mi.Emitter, float]):
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]) for e in radii]
-        #: Number that Dr.Jit gives to the first of them.
-        self.first = min(numbers)
-        table = np.zeros(max(numbers) - self.first + 1, np.float32)
-        table[np.array(numbers) - self.first] = list(radii.values())
-        # Not in NumPy's memory, for frozen functions.
-        self.radii = mi.Float(table) * dr.opaque(mi.Float, 1)
-        dr.eval(self.radii)
+        self.radii = EmitterTable(radii)
 
     def vicinity(self, emitter: mi.EmitterPtr) -> Vicinity:
         """That in which directions to an emitter are held; of those that are not close, nothing."""
-        number, last = dr.reinterpret_array(mi.UInt32, emitter), self.first + dr.width(self.radii) - 1
-        known = (number >= self.first) & (number <= last)
-        radius = dr.gather(mi.Float, self.radii, dr.clip(number, self.first, last) - self.first)
-        return Vicinity(dr.select(known, radius, 0))
+        return Vicinity(self.radii.of(emitter))
 
 
 def divisible(lamp: mi.Shape) -> bool:

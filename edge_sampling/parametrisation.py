@@ -8,10 +8,11 @@ what the camera sees                  the film position: the *ray* is fixed on t
 every further vertex of a path        far from the vertex before: the *material point*, which follows its surface;
                                       close to it, or behind rough glass: the direction, so that the vertex
                                       slides over its surface
-a point on a lamp                     the material point; close to one of the `CloseLamps`, the direction
+a point on a lamp                     the material point; close to one of the `CloseLamps`, the direction; in a
+                                      narrow lobe, the direction relative to that
 one side of a boundary                as the interior term has the point that is seen there
 a point of a light without size       the light's own numbers: it goes where the light goes
-what is infinitely far away           the direction
+what is infinitely far away           the direction; in a narrow lobe, relative to that
 what a perfect mirror shows           the random numbers: the ray turns with the mirror
 ====================================  ======================================================================
 
@@ -22,7 +23,7 @@ moves together sees no motion at all.
 Where two surfaces meet and only one of x and y moves, the change of 1 / r² has no finite variance. So scattered light
 is divided: the part `far(r)` of what arrives from a point at the distance r is held at the material point, the rest in
 its direction. Both parts add up to the whole, so that the division may be chosen at will (`Vicinity`). So is the light
-of lamps that are close to what they light (`close_lamps.py`).
+of lamps that are close to what they light, and in narrow lobes (`divided_light.py`).
 
 Through rough glass, a surface looks in few directions. Of a material point that moves out of them, the change relative
 to its value is large. So what rough glass shows is held in its direction, however far it is; but not where there are
@@ -49,6 +50,12 @@ GRAZING = 1e-3
 
 #: Radius of the vicinity of a vertex, relative to the distance of the camera from the first vertex of its path.
 VICINITY = 0.2
+
+#: Directions turn with a lobe up to so many widths from its axis.
+REACH = 8
+
+#: Nothing turns with lobes in the light of lamps that are seen smaller than so many widths.
+WIDE = 1.5
 
 #: Height over a tangent plane that is taken for rounding, in units in the last place of the coordinates.
 FLUSH = 16
@@ -185,8 +192,14 @@ class Vicinity:
     def far(self, r2: mi.Float) -> mi.Float:
         """Part of the light from the squared distance `r2` that is held at the material point: 1 from the radius on,
         and in proportion to r2 near 0. It may be attached."""
-        s = dr.select(self.radius > 0, dr.minimum(r2 / dr.square(dr.maximum(self.radius, 1e-18)), 1), 1)
-        return 1 - (1 - s) * dr.square(1 - s)
+        s = dr.select(self.radius > 0, r2 / dr.square(dr.maximum(self.radius, 1e-18)), 1)
+        return _blend(s)
+
+
+def _blend(s: mi.Float) -> mi.Float:
+    """From 0 to 1 where s does, smooth at 1."""
+    rest = 1 - dr.minimum(s, 1)
+    return 1 - rest * dr.square(rest)
 
 
 def slides_behind_glass(scene: mi.Scene, shaded: list[mi.Shape]) -> bool:
@@ -198,6 +211,93 @@ def slides_behind_glass(scene: mi.Scene, shaded: list[mi.Shape]) -> bool:
     if shaded or None in bsdfs:
         return False
     return any(b.flags() & mi.BSDFFlags.GlossyTransmission for b in bsdfs)
+
+
+# ---------------------- Lobes ----------------------
+
+
+@dataclass
+class Turning:
+    """The narrow lobe of a BSDF as a viewer sees it, with which directions turn.
+
+    axis : mi.Vector3f, unit vector, world space; may be attached.
+    width : mi.Float, radians; detached; 0 where there is no narrow lobe.
+    size : mi.Float, of what sends light; infinite, if that is infinitely far away; 0: nothing turns.
+    """
+
+    axis: mi.Vector3f
+    width: mi.Float
+    size: mi.Float
+
+    @property
+    def anywhere(self) -> mi.Bool:
+        """Does anything turn?"""
+        return (self.width > 0) & (self.size > 0)
+
+    def part(self, ω: mi.Vector3f, r2: mi.Float | None = None) -> mi.Float:
+        """Part of the light from a direction, and a squared distance, whose direction turns: 1 on the axis of a lobe
+        that is much narrower than what sends it. It may be attached. r2 : None: from infinitely far away."""
+        active = self.anywhere
+        width = dr.select(active, self.width, 1)
+        part = 1 - _blend(dr.squared_norm(ω - self.axis) / dr.square(REACH * width))
+        if r2 is None:
+            return dr.select(active & (self.size == dr.inf), part, 0)
+        part *= 1 - _blend(r2 * dr.square(WIDE * width / dr.select(active, self.size, 1)))
+        return dr.select(active, part, 0)
+
+    def turned(self, d: mi.Vector3f) -> mi.Vector3f:
+        """The direction d, as it turns with the axis: without turning about that."""
+        d = dr.detach(d)
+        turns = dr.cross(dr.cross(dr.detach(self.axis), self.axis), d)
+        return dr.replace_grad(d, dr.select(self.anywhere, turns, 0))
+
+
+@dataclass
+class Division:
+    """How the light that arrives at a point is divided: a part is held at the material point from where it comes, the
+    rest in its direction.
+
+    turning : with which directions turn; None: they do not.
+    """
+
+    vicinity: Vicinity
+    turning: Turning | None = None
+
+    def anywhere(self, *, turning: bool) -> Vicinity:
+        """The ball in which directions are held, whichever they are. turning : those that turn, too?"""
+        if self.turning is None or not turning:
+            return self.vicinity
+        return Vicinity(dr.select(self.turning.anywhere, dr.inf, self.vicinity.radius))
+
+    def held(self, r2: mi.Float, ω: mi.Vector3f) -> mi.Float:
+        """Part of the light from the squared distance `r2` and the direction ω that is held at the material point. It
+        may be attached."""
+        far = self.vicinity.far(r2)
+        return far if self.turning is None else far * (1 - self.turning.part(ω, r2))
+
+    def held_at_infinity(self, ω: mi.Vector3f) -> mi.Float:
+        """The same, from infinitely far away: there, it is the part of which directions do not turn."""
+        return mi.Float(1) if self.turning is None else 1 - self.turning.part(ω)
+
+    def held_beside(self, d: mi.Vector3f, ω: mi.Vector3f, valid: mi.Bool) -> mi.Float:
+        """The same of what a ray past an edge, in the direction ω, meets at the place d; or infinitely far away, if it
+        meets nothing. Detached."""
+        held = dr.select(valid, self.held(dr.squared_norm(d), ω), self.held_at_infinity(ω))
+        return dr.detach(held)
+
+    def turned(self, d: mi.Vector3f) -> mi.Vector3f:
+        """The direction d as it is held."""
+        return dr.detach(d) if self.turning is None else self.turning.turned(d)
+
+    def at_infinity(self, d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
+        """The direction d to what is infinitely far away, attached; and the change of both parts, as `Connection` has
+        it."""
+        if self.turning is None:
+            return d, mi.Float(1)
+        d = dr.detach(d)
+        held = self.held_at_infinity(d)
+        now = dr.detach(held)
+        return dr.replace_grad(d, dr.lerp(self.turned(d), d, now)), 1 + held - now
 
 
 # ---------------------- What joins two of them ----------------------
@@ -223,21 +323,22 @@ class Connection:
     smooth: mi.Bool
     spread: mi.Float
 
-    def sliding(self, x: mi.SurfaceInteraction3f, d: mi.Vector3f, vicinity: Vicinity, active: mi.Bool) -> Connection:
-        """The same where y slides in the vicinity of x: a part is held at the material point, the rest in its direction
-        d, and both follow the change of this part along their own motion. Only ω and `geometry` are those of y as it
-        slides."""
+    def sliding(self, x: mi.SurfaceInteraction3f, d: mi.Vector3f, division: Division, active: mi.Bool) -> Connection:
+        """The same where y slides, seen from x: a part is held at the material point, the rest in its direction d, and
+        both follow the change of this part along their own motion. Only ω and `geometry` are those of y as it slides.
+        """
         between, n, d = self.y.p - x.p, dr.detach(self.y.n), dr.detach(d)
-        held = vicinity.far(dr.detach(dr.squared_norm(between)))
-        cosine = dr.dot(d, n)
-        active = active & ~self.still & (cosine != 0) & (held < 1)
+        held = division.held(dr.detach(dr.squared_norm(between)), d)
+        held = dr.detach(held)
+        turned = division.turned(d)
+        active = active & ~self.still & (dr.dot(d, n) != 0) & (held < 1)
         # Along the ray, to the plane that moves with y.
-        along = dr.dot(between, n) / dr.select(active, cosine, 1)
-        near = 1 - vicinity.far(dr.square(along))
-        geometry = held * self.geometry + vicinity.far(dr.squared_norm(between)) + near
+        along = dr.dot(between, n) / dr.select(active, dr.dot(turned, n), 1)
+        rest = 1 - division.held(dr.square(along), turned)
+        geometry = held * self.geometry + division.held(dr.squared_norm(between), self.ω) + rest
         geometry = dr.replace_grad(self.geometry, dr.select(active, geometry, self.geometry))
-        ω = dr.replace_grad(self.ω, dr.select(active, dr.lerp(d, self.ω, held), self.ω))
-        return replace(self, ω=ω, geometry=geometry, smooth=self.smooth & (vicinity.radius == 0))
+        ω = dr.replace_grad(self.ω, dr.select(active, dr.lerp(turned, self.ω, held), self.ω))
+        return replace(self, ω=ω, geometry=geometry, smooth=self.smooth & (held == 1))
 
     def attach(self, weight: mi.Float, p: mi.Float, q: mi.Float, *, by_light: bool) -> mi.Float:
         """Attach a weight of multiple importance sampling where y is on one of the `SmoothLamps`.

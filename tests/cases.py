@@ -33,6 +33,7 @@ from hidden_lights import HIDDEN
 from instances import INSTANCES
 from joints import JOINTS
 from mirrors import MIRRORS, ball_of_index
+from polished import POLISHED
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
 from touching_lamps import TOUCHING
@@ -913,6 +914,10 @@ CASES = [
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=1024)
         for k, (*of, depth) in TOUCHING.items()
+    ),
+    *(
+        Case(k, *of, spp=256, runs=16, integrator=upto(depth), reference_spp=4096)
+        for k, (*of, depth) in POLISHED.items()
     ),
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k.endswith("_slides") else 1024)

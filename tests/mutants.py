@@ -76,7 +76,7 @@ MUTANTS = [
         "normal_velocity = 1.02 * dr.dot(points.n_dl, points.velocity)",
     ),
     mutant("shadows from lights: 2 % too large", SHADOWS, "value = jump * dr.dot", "value = 1.02 * jump * dr.dot"),
-    mutant("edges from points: 2 % too large", SHADING, "value = -side * L", "value = -1.02 * side * L"),
+    mutant("edges from points: 2 % too large", SHADING, "faces * edge - side * (", "faces * edge - 1.02 * side * ("),
     mutant(
         "planes of faces: twice as large",
         "edge_sampling/boundaries/face_planes.py",
@@ -94,8 +94,8 @@ MUTANTS = [
     mutant(
         "edges from points: velocity of what is seen left out",
         SHADING,
-        "(edge - far * turning(n_dl, d, valid))",
-        "edge",
+        "held * L * (edge - turning(n_dl, d, valid))",
+        "held * L * edge",
     ),
     mutant(
         "shadows from lights: motion of the light not followed",
@@ -112,8 +112,8 @@ MUTANTS = [
     mutant(
         "interior: rotation of the environment left out",
         SCATTERING,
-        "attached = dr.select(on_surface, attached, elsewhere)",
-        "attached = dr.select(on_surface, attached, dr.detach(elsewhere))",
+        "attached = dr.select(on_surface, attached, from_there)",
+        "attached = dr.select(on_surface, attached, dr.detach(from_there))",
     ),
     mutant(
         "interior: background stands still when the camera turns",
@@ -295,8 +295,8 @@ MUTANTS = [
     mutant(
         "vicinity: its weight has no derivative",
         PARAMETRISATION,
-        "near = 1 - vicinity.far(dr.square(along))",
-        "near = 1 - vicinity.far(dr.square(dr.detach(along)))",
+        "rest = 1 - division.held(dr.square(along), turned)",
+        "rest = 1 - division.held(dr.square(dr.detach(along)), turned)",
     ),
     mutant(
         "vicinity: normals that face away stay so just inside of an outline",
@@ -313,7 +313,7 @@ MUTANTS = [
     mutant(
         "close lamps: shadows that are found from them are those of their whole light",
         SHADOWS,
-        "Le *= tracer.lamps.vicinity(light.emitter).far(r2)",
+        "Le *= tracer.lamps.at(turning, light.emitter).held(r2, ω_x)",
         "Le *= 1",
     ),
     mutant(
@@ -323,10 +323,28 @@ MUTANTS = [
         "L = mi.Spectrum(0)",
     ),
     mutant(
+        "narrow lobes: shadows that are found from lamps are those of their whole light",
+        SHADOWS,
+        "turning = tracer.lamps.turning(si, si.bsdf(), active) if self.at_first else None",
+        "turning = None",
+    ),
+    mutant(
+        "narrow lobes: boundaries do not turn with them",
+        SHADING,
+        "edge += dr.dot(n_dl, dr.select(active, ω - division.turned(ω), 0))",
+        "edge += 0",
+    ),
+    mutant(
+        "narrow lobes: edges at points do not know how they turn, where light is scattered more than once",
+        REPLAY,
+        "dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(here), later))",
+        "dr.set_grad(leaf, dr.select(at_first & (leaf is not self.leaves[3]), mi.Vector3f(here), later))",
+    ),
+    mutant(
         "vicinity: edges behind rough glass count on one side",
         SHADING,
-        "point.vicinity.around(bsdf).radius",
-        "point.vicinity.radius",
+        "to_surface = Division(point.vicinity.around(bsdf))",
+        "to_surface = Division(point.vicinity)",
     ),
     mutant(
         "film boundary: light from one of two lunes",
@@ -337,8 +355,8 @@ MUTANTS = [
     mutant(
         "edges from points: only what is seen past silhouettes counts",
         SHADING,
-        "(edge - far * turning(n_dl, d, valid)) + faces * edge",
-        "(edge - far * turning(n_dl, d, valid))",
+        "return faces * edge - side",
+        "return -side",
     ),
     # ---------------------- Channels besides light ----------------------
     mutant(

@@ -23,7 +23,8 @@ from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.parametrisation import in_plane, material_point
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
 
-from .shading_boundary import density_from_points, look, turning
+from .past_edges import look, turning
+from .shading_boundary import density_from_points
 from .shadow_boundary import LightPoint, LitEdge, ShadowBoundary, fall
 from .tracer import LightTracer, ShadingPoint
 

@@ -20,8 +20,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.divided_light import division_of
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, is_smooth, surfaces
-from rimlight.edge_sampling.parametrisation import Vicinity, material_point
+from rimlight.edge_sampling.parametrisation import Division, material_point
 from rimlight.edge_sampling.rays import spawn_ray
 
 from .tracer import ShadingPoint, Tracer
@@ -52,7 +53,7 @@ class FacePlanes:
             frame = mi.Frame3f(at.n)
             ω = frame.s * c + frame.t * s
             active = active & ours & at.is_valid()
-            sides, lamps = [], tracer.lamps
+            sides = []
             for side in (1, -1):
                 ray = spawn_ray(scene, at, dr.normalize(ω + side * BESIDE_PLANE * at.n))
                 # (Mitsuba's `normalmap` reflects nothing that arrives from behind the face.)
@@ -62,22 +63,22 @@ class FacePlanes:
                 y = pi.compute_surface_interaction(ray, mi.RayFlags.All, reflects)
                 emitter, scattered = y.emitter(scene, reflects), mi.Spectrum(0)
                 emitted = emitter.eval(y, reflects)
-                near = Vicinity(mi.Float(0)) if lamps is None else lamps.vicinity(emitter)
+                near = division_of(tracer.lamps, point.turning, emitter)
                 if tracer.scatters(2):
                     onwards = reflects & y.is_valid() & tracer.scatters(point.depth + 1)
                     scattered = tracer.scattered(ray, pi, point.depth, sampler.clone(), onwards)
                     scattered = dr.select(onwards, scattered, 0)
                 jumps = [dr.select(reflects, side * F * L, 0) for L in (emitted, scattered)]
                 sides.append((ray, pi, reflects & y.is_valid(), jumps, near))
-            vicinity = point.vicinity.around(at.bsdf())
+            scatters = Division(point.vicinity.around(at.bsdf()))
         value = mi.Spectrum(0)
         with dr.resume_grad():
             for ray, pi, valid, jumps, near in sides:
                 d = material_point(ray, pi, valid).p - si.p
                 # What is infinitely far away is seen in a fixed direction.
                 towards = dr.normalize(dr.select(valid, d, mi.Vector3f(ω)))
-                for jump, around in zip(jumps, (near, vicinity), strict=True):
-                    held = dr.select(valid, around.far(dr.detach(dr.squared_norm(d))), 1)
-                    g = dr.dot(si.n, dr.lerp(dr.detach(towards), towards, held))
+                for jump, division in zip(jumps, (near, scatters), strict=True):
+                    held = division.held_beside(d, towards, valid)
+                    g = dr.dot(si.n, dr.lerp(division.turned(towards), towards, held))
                     value += jump * dr.select(active, g - dr.detach(g), 0)
         return value

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.choice.silhouettes import Silhouettes
-from rimlight.edge_sampling.close_lamps import CloseLamps
+from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_lines import TextureLines
 
@@ -27,7 +27,7 @@ class Boundaries:
     may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` : those whose fringe is not looked
     at closely. `textures` : where those jump that the camera may see move, and mapped normals turn away. `shown` :
     shadows that mirrors or glass may show. `surfaces` : what chains meet, where there are mirrors or textures.
-    `lights` : chooses one, where there are many. `lamps` : whose light is held in its direction near them.
+    `lights` : chooses one, where there are many. `lamps` : how their light is divided.
     `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from surfaces."""
 
     film: FilmBoundary | None = None
@@ -47,7 +47,7 @@ class Boundaries:
     surfaces: Surfaces | None = None
     lights: LightChoice | None = None
     deep: DeepShadows | None = None
-    lamps: CloseLamps | None = None
+    lamps: DividedLight | None = None
 
     @property
     def silhouettes(self) -> Silhouettes | None:

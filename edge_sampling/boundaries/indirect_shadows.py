@@ -78,6 +78,7 @@ class IndirectShadows(ShadowBoundary):
     """
 
     DRJIT_STRUCT = ShadowBoundary.DRJIT_STRUCT | dict.fromkeys(("candidates", "continues", "moving_shapes"))
+    at_first = False
 
     def __init__(
         self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None = None, *, hidden: bool = False

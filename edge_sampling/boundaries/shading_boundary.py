@@ -28,13 +28,15 @@ from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
 from rimlight.edge_sampling.choice.sampling import EdgeSample, Reservoir, power_heuristic
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Cone, Lobe, View
+from rimlight.edge_sampling.divided_light import division_of
 from rimlight.edge_sampling.geometry.meshes import has_interpolated_normals, is_met, pointer
-from rimlight.edge_sampling.parametrisation import Vicinity, in_plane, material_point
+from rimlight.edge_sampling.parametrisation import Division, Vicinity, in_plane, material_point
 from rimlight.edge_sampling.rays import spawn_ray
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .indirect_shadows import is_bent, share
 from .lune import Lune, spreads
+from .past_edges import look, turning
 from .tracer import ShadingPoint, Tracer
 
 #: Directions that are sampled from a BSDF, to find its peak.
@@ -137,9 +139,9 @@ class ShadingBoundary:
             number, p_light = self._choose(tracer, si.p, facing, sampler, emission)
             cone = self.boxes.cone(number, si.p)
             light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), number, emission)
-            to_lamp = Vicinity(mi.Float(0)) if tracer.lamps is None else tracer.lamps.vicinity(light)
+            to_lamp = division_of(tracer.lamps, point.turning, light)
             if not self.emission_at_first:
-                emission &= (point.depth != 1) | (self.boxes.distance(number, si.p) < to_lamp.radius)
+                emission &= (point.depth != 1) | (self.boxes.distance(number, si.p) < to_lamp.vicinity.radius)
 
             # ---------------------- An edge ----------------------
 
@@ -149,18 +151,18 @@ class ShadingBoundary:
                 dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), dr.inv_pi, 0.1 * dr.inv_pi),
                 [self._lobe(si, bsdf, sampler, active)] if self.glossy else [],
             )
-
-            radius = point.vicinity.around(bsdf).radius
+            to_surface = Division(point.vicinity.around(bsdf))
+            both_sides = tracer.scatters(2) or tracer.lamps is not None
 
             def candidate(part, emitted, active, sampler):
                 """An edge for emitted light, which is sought in the directions of one light; or for scattered light,
                 which is sought everywhere, and where both sides of edges close by count. And about what it contributes
                 if nothing hides it."""
-                vicinity = Vicinity(dr.select(emitted, to_lamp.radius, radius))
+                division = _either(emitted, to_lamp, to_surface)
                 towards = replace(
                     view,
                     cone=Cone(cone.axis, dr.select(emitted, cone.cos, -1), cone.sin),
-                    vicinity=vicinity if tracer.scatters(2) or tracer.lamps is not None else None,
+                    vicinity=division.anywhere(turning=self.silhouettes.joined_lamps) if both_sides else None,
                 )
                 # What is seen past an edge that stands still may move. What emits does not: else all would be in one
                 # group.
@@ -170,18 +172,19 @@ class ShadingBoundary:
                 outline = self.silhouettes.point(placement, e, si.p)
                 d = outline.p - si.p
                 r2 = dr.squared_norm(d)
-                f = bsdf.eval(mi.BSDFContext(), si, si.to_local(dr.normalize(d)), active)
+                ω = d * dr.rsqrt(r2)
+                f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
                 arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
                 seen_past = outline.outward(dr.cross(d, outline.tangent), d) != 0
-                crease = self.silhouettes.crease(e, outline) * (1 - vicinity.far(r2))
+                crease = self.silhouettes.crease(e, outline) * (1 - division.held(r2, ω))
                 # The closer an edge is, the faster its direction turns.
                 turn = dr.rsqrt(r2) * self.silhouettes.preferred(e, use)
                 return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
 
             e, emission = _chosen(candidate, choice, emission, scattering, sampler)
             e.density *= dr.select(emission, p_light, 1)
-            vicinity = Vicinity(dr.select(emission, to_lamp.radius, radius))
-        return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, vicinity)
+            division = _either(emission, to_lamp, to_surface)
+        return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, division)
 
     @staticmethod
     def _lobe(si, bsdf, sampler, active) -> Lobe:
@@ -224,12 +227,12 @@ class ShadingBoundary:
         active: mi.Bool,
         light: mi.EmitterPtr,
         emission: mi.Bool,
-        vicinity: Vicinity,
+        division: Division,
     ) -> mi.Spectrum:
         """What a point on an edge does to the light that is reflected.
 
         light : the only one whose emission counts. emission : does emitted light count, or scattered light?
-        vicinity : within which the directions are held, in which this light arrives.
+        division : how this light is divided; attached.
         """
         scene, si = tracer.scene, point.si
         with dr.suspend_grad():
@@ -248,7 +251,7 @@ class ShadingBoundary:
             across = dr.normalize(n_dl)
             outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
             # Of a crease, both sides are faces of its own.
-            near = 1 - vicinity.far(dr.square(distance))
+            near = dr.detach(1 - division.held(dr.square(distance), ω))
             active &= (outward != 0) | (near > 0)
             n_dl = dr.select(active, n_dl, 0)
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
@@ -288,12 +291,12 @@ class ShadingBoundary:
             x = si.p + lift
             edge = turning(n_dl, p - x, active)
             d = material_point(ray, pi, valid).p - x
-            far = vicinity.far(dr.detach(dr.squared_norm(d)))
-            value = -side * L * (edge - far * turning(n_dl, d, valid)) + faces * edge
-            if tracer.lamps is not None:
-                # From lamps, only the part is found that is held at their points.
-                value -= side * from_lamp * dr.select(valid, 1 - far, 0) * edge
-            return value
+            held = division.held_beside(d, ω, valid)
+            # Relative to the material point, and to the direction that is held.
+            past_point = held * L * (edge - turning(n_dl, d, valid))
+            edge += dr.dot(n_dl, dr.select(active, ω - division.turned(ω), 0))
+            # From lamps, only the part is found that is held at their points.
+            return faces * edge - side * (past_point + (1 - held) * (L + from_lamp) * edge)
 
     def _shown_by_faces(
         self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune
@@ -386,6 +389,12 @@ def _found_from_points(
     return dr.select(active & (point.depth > 1), found, dr.inf)
 
 
+def _either(emitted: mi.Bool, to_lamp: Division, to_surface: Division) -> Division:
+    """How the light is divided that lamps emit, or that surfaces scatter."""
+    radius, turning = dr.select(emitted, to_lamp.vicinity.radius, to_surface.vicinity.radius), to_lamp.turning
+    return Division(Vicinity(radius), turning and replace(turning, size=dr.select(emitted, turning.size, 0)))
+
+
 def _chosen(
     candidate: Callable, choice: mi.Float, emission: mi.Bool, scattering: mi.Bool, sampler: mi.Sampler
 ) -> tuple[EdgeSample, mi.Bool]:
@@ -418,25 +427,3 @@ def _chosen(
     e = dr.select(for_emission, emitted, scattered).kept(count)
     e.density *= dr.select(for_emission, p, 1 - p)
     return e, for_emission
-
-
-def look(scene, si, x, p, outline, beside, aside, distance, active):
-    """What is seen from x at the point p of an edge and a little beside it: ray, intersections; whether something
-    before the edge hides it; and whether it is a surface on which the edge lies.
-
-    outline : what is known of the edge there. aside : how far from the edge such a surface may be. distance : from x
-    to p.
-    """
-    ray = spawn_ray(scene, si, dr.normalize(mi.Point3f(p + beside) - x))
-    pi = scene.ray_intersect_preliminary(ray, active=active)
-    y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    # Not a surface on which the edge lies: beside the edge, that may be met a little earlier.
-    off = dr.abs_dot(y.n, p - y.p) > aside
-    hidden = dr.select(off, pi.t < distance, outline.is_behind(y.n, ray.d))
-    return ray, pi, y, pi.is_valid() & hidden, pi.is_valid() & ~off
-
-
-def turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:
-    """Zero, with the gradient of the direction of d, along `n_dl`."""
-    ω = dr.normalize(dr.select(valid, d, mi.Vector3f(0, 0, 1)))
-    return dr.select(valid, dr.dot(n_dl, ω - dr.detach(ω)), 0)

@@ -82,6 +82,9 @@ class ShadowBoundary:
         ("silhouettes", "lights", "smooth_lamps", "chosen", "any_surface", "any_other", "spots")
     )
 
+    #: Does the sensor see the shadows itself, at the first vertices of paths?
+    at_first = True
+
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
         self.silhouettes = silhouettes
         self.lights, self.smooth_lamps = Lights(scene), SmoothLamps(scene)
@@ -289,7 +292,8 @@ class ShadowBoundary:
             Le = light.emitter.eval(on_light, emitting) * (cos / r2)
             if tracer.lamps is not None:
                 # Only the part of its light that is held at the point of the lamp.
-                Le *= tracer.lamps.vicinity(light.emitter).far(r2)
+                turning = tracer.lamps.turning(si, si.bsdf(), active) if self.at_first else None
+                Le *= tracer.lamps.at(turning, light.emitter).held(r2, ω_x)
             L = dr.select(on_surface, Le * mis, L)
         return met, dr.select(active, f * L * view.weight, 0), active
 

@@ -8,8 +8,8 @@ from typing import Protocol
 import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
-from rimlight.edge_sampling.close_lamps import CloseLamps
-from rimlight.edge_sampling.parametrisation import Vicinity
+from rimlight.edge_sampling.divided_light import DividedLight
+from rimlight.edge_sampling.parametrisation import Turning, Vicinity
 
 from .crease import Directions
 from .horizon import Horizon
@@ -27,6 +27,7 @@ class ShadingPoint:
     slides : mi.Bool, may it move with the vertices before, though its surface stands still?
     vicinity : that of its path.
     density : mi.Float, by area, with which it was found from the vertex before; infinite if that is a mirror. Detached.
+    turning : with which directions turn there; attached. None: with nothing.
     """
 
     si: mi.SurfaceInteraction3f
@@ -36,6 +37,7 @@ class ShadingPoint:
     slides: mi.Bool
     vicinity: Vicinity
     density: mi.Float
+    turning: Turning | None = None
 
 
 class Tracer(Protocol):
@@ -43,13 +45,13 @@ class Tracer(Protocol):
 
     scene : mi.Scene
     lights : chooses one of many lights; None: all are equally likely.
-    lamps : those whose light is held in its direction near them; None: there are none.
+    lamps : how their light is divided; None: it is held at points of the lamps.
     shares_directions : may it be told in which directions to look for the light that a crease reflects?
     """
 
     scene: mi.Scene
     lights: LightChoice | None
-    lamps: CloseLamps | None
+    lamps: DividedLight | None
     shares_directions: bool
 
     def scatters(self, depth: mi.UInt32 | int) -> mi.Bool | bool:

@@ -107,6 +107,9 @@ class Silhouettes:
         if moving is not None:
             moves = edges.is_line | np.array(moving, bool)[edges.mesh].any(axis=1)
         self._still = mi.Bool(~moves)
+        emits = np.array([s.is_emitter() for s in (*geometry.meshes, *geometry.analytic)], bool)[edges.mesh]
+        #: Do lamps share edges with what does not emit?
+        self.joined_lamps = bool(geometry.joints) or bool((emits[:, 0] != emits[:, 1])[~edges.is_line].any())
         groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         #: Number of groups of edges.
         self.groups = len(groups)

@@ -36,7 +36,7 @@ from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.choice.light_choice import LightChoice
-from rimlight.edge_sampling.close_lamps import CloseLamps
+from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
 from rimlight.edge_sampling.geometry.meshes import inner, surfaces
@@ -252,7 +252,7 @@ class BoundarySearch:
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int
-    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, tuple[IndirectShadows, ...], CloseLamps | None]:
+    ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, tuple[IndirectShadows, ...], DividedLight | None]:
         """What samples the edges of which lights and shading points know, as far as it is needed; and the lamps near
         which points know of all edges."""
         if not sppi or not scene.emitters() or not self.depths.scatters(1):
@@ -265,7 +265,7 @@ class BoundarySearch:
         if self.from_points:
             shapes = None if everything else list(moving.shapes)
             shading = ShadingBoundary(scene, silhouettes, shapes)
-            lamps = None if self.geometry.others else CloseLamps.of(scene)
+            lamps = None if self.geometry.others else DividedLight.of(scene, shapes)
             needed = self.depths.scatters(2) or shading.emission_at_first or lamps is not None
             shading = shading if needed else None
             kinds = (IndirectShadows, IndirectBeams) if self.depths.scatters(2) else ()

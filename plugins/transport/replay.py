@@ -9,14 +9,14 @@ visited again from its end (as path replay, Vicini et al. 2021, but with memory 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
-from rimlight.edge_sampling.close_lamps import CloseLamps
+from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
 from rimlight.edge_sampling.refusals import Refusal
 
@@ -44,7 +44,7 @@ class Chain:
     """The vertices of paths behind the first, as they move.
 
     vicinity : in which they slide.
-    lights, lamps : see `Scattering`.
+    lights : see `Scattering`. lamps : how their light is divided at the first vertex.
     """
 
     def __init__(
@@ -52,9 +52,10 @@ class Chain:
         scene: mi.Scene,
         vicinity: Vicinity,
         lights: LightChoice | None = None,
-        lamps: CloseLamps | None = None,
+        lamps: DividedLight | None = None,
     ):
-        self.scattering = Scattering(scene, attached=True, lights=lights, lamps=lamps)
+        behind_first = None if lamps is None else lamps.behind_first
+        self.scattering = Scattering(scene, attached=True, lights=lights, lamps=behind_first)
         self.vicinity = vicinity
 
     def surface(self, vertex: Vertex, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -117,7 +118,7 @@ class Replay:
         depths: Depths,
         active: mi.Bool,
         lights: LightChoice | None = None,
-        lamps: CloseLamps | None = None,
+        lamps: DividedLight | None = None,
     ):
         self.scene, self.sampler, self.vertex, self.start, self.depths = scene, sampler, vertex, start, depths
         self.chain = Chain(scene, vicinity, lights, lamps)
@@ -223,6 +224,7 @@ class MovingVertex:
     log : the path up to it; and one vertex more, if `onwards`.
     vertex, active, since : see `choose_vertex`.
     onwards : is the direction to the vertex beyond wanted, too? It is `d`, with gradients of its own.
+    lamps : see `Chain`. With the lobes of the first vertices, directions are `turning`, with gradients of their own.
     """
 
     def __init__(
@@ -237,6 +239,7 @@ class MovingVertex:
         mode: dr.ADMode,
         *,
         onwards: bool = False,
+        lamps: DividedLight | None = None,
     ):
         self.chain, self.first, self.log, self.vicinity = chain, first, log, chain.vicinity
         self.vertex, self.active, self.since = vertex, active, since
@@ -245,19 +248,27 @@ class MovingVertex:
         self._last = self.depth + 1 if onwards else self.depth
         self._start(ray)
         at_first = self.depth == 1
+        turning, self._axis = None, mi.Vector3f(0)
+        if lamps is not None:
+            with dr.resume_grad():
+                turning = lamps.turning(self.at_first, self.at_first.bsdf(), active & at_first)
+        if turning is not None:
+            self._axis = turning.axis
         with dr.suspend_grad():
             other = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
             self.si = dr.select(at_first, dr.detach(self.at_first), other)
             beyond = log.vertex(self._last, active).ray.d
-        self.p, self.n, self.d = leaves(self.si.p, self.si.n, beyond)
+        self.p, self.n, self.d, axis = self.leaves = leaves(self.si.p, self.si.n, beyond, self._axis)
         with dr.resume_grad():
             self.si.p, self.si.n = self.p, self.n
+            self.turning = turning and replace(turning, axis=axis)
             if mode == dr.ADMode.Forward:
-                p, n, o, d = derivatives(self.at_first.p, self.at_first.n, self.start.o, self.start.d)
-                moved = self._forward(o, d)
-                for leaf, first, later in zip((self.p, self.n, self.d), (p, n, d), moved, strict=True):
-                    dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(first), later))
-                self.at_first = self.start = None
+                first = self.at_first
+                δp, δn, δo, δd, δaxis = derivatives(first.p, first.n, self.start.o, self.start.d, self._axis)
+                moved = *self._forward(δo, δd), mi.Vector3f(0)
+                for leaf, here, later in zip(self.leaves, (δp, δn, δd, δaxis), moved, strict=True):
+                    dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(here), later))
+                self.at_first = self.start = self._axis = None
 
     def _start(self, ray: mi.Ray3f) -> None:
         """The first vertex, and what moves the second."""
@@ -308,13 +319,13 @@ class MovingVertex:
 
     def schedule(self) -> None:
         """Let the next evaluation find the gradients, in the kernel of what they come from."""
-        dr.schedule(dr.grad(self.p), dr.grad(self.n), dr.grad(self.d))
+        dr.schedule(*(dr.grad(leaf) for leaf in self.leaves))
 
     def backward(self) -> None:
         """Hand the gradients on to the surfaces, and to the camera rays."""
         chain, log = self.chain, self.log
-        δp, δn, δd = dr.grad(self.p), dr.grad(self.n), dr.grad(self.d)
-        dr.eval(δp, δn, δd)
+        δp, δn, δd, δaxis = (dr.grad(leaf) for leaf in self.leaves)
+        dr.eval(δp, δn, δd, δaxis)
 
         def bounce(depth, δp, δn, δd):
             active = self.active & (depth >= dr.maximum(self.since, 2))
@@ -340,6 +351,7 @@ class MovingVertex:
         with dr.resume_grad():
             si, start = self.at_first, self.start
             value = dr.dot(dr.select(at_first, δp, 0), si.p) + dr.dot(dr.select(at_first, δn, 0), si.n)
+            value += dr.dot(dr.select(at_first, δaxis, 0), self._axis)
             to_first = dr.select(at_first, mi.Vector3f(δd), to_first)
             chained = self.active & (self._last > 1) & (self.since == 1)
             value += dr.select(chained & ~at_first, dr.dot(δo, start.o), 0)
@@ -351,7 +363,7 @@ class ChosenVertex(MovingVertex):
     """One vertex of each path, chosen in proportion to its throughput, as it moves.
 
     sampler : of the paths.
-    glass : see `Vicinity`.
+    glass : see `Vicinity`. lamps : see `Chain`.
     """
 
     def __init__(
@@ -363,6 +375,7 @@ class ChosenVertex(MovingVertex):
         depths: Depths,
         mode: dr.ADMode,
         glass: bool,
+        lamps: DividedLight | None = None,
     ):
         vicinity = Vicinity.of(first.pi, glass)
         chain = Chain(scene, vicinity)
@@ -381,7 +394,7 @@ class ChosenVertex(MovingVertex):
 
         log, chosen = written(scene, first.ray, 1, depths, follow, lambda chosen: chosen[0].depth)
         vertex, active, since, self.density = chosen
-        super().__init__(chain, ray, first, log, vertex, active, since, mode)
+        super().__init__(chain, ray, first, log, vertex, active, since, mode, lamps=lamps)
 
 
 def written(

@@ -10,9 +10,9 @@ import mitsuba as mi
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
-from rimlight.edge_sampling.close_lamps import CloseLamps
+from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.meshes import objects_below, surfaces
-from rimlight.edge_sampling.parametrisation import Connection, Parametrisation, Vicinity, shown_by_mirror
+from rimlight.edge_sampling.parametrisation import Connection, Division, Parametrisation, Vicinity, shown_by_mirror
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to_light
 
 from .matt import MattDirections, turning
@@ -65,7 +65,7 @@ class Scattering:
 
     attached : carry gradients? Otherwise values only.
     lights : chooses one of many lights; None: Mitsuba does.
-    lamps : whose light is held in its direction near them.
+    lamps : how their light is divided; None: it is held at points of the lamps.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Scattering:
         *,
         attached: bool,
         lights: LightChoice | None = None,
-        lamps: CloseLamps | None = None,
+        lamps: DividedLight | None = None,
     ):
         self.scene, self.lights, self.lamps = scene, lights, lamps
         self.attached = attached
@@ -213,18 +213,21 @@ class Scattering:
         visible = dr.select(on_surface, pi.is_valid() & (pi.t >= before), ~pi.is_valid())
         with dr.resume_grad():
             to_lamp = self.held.connect(si, pi, ray, on_surface & visible, by_light=True)
+            elsewhere, change = ds.d, mi.Float(1)
             if self.lamps is not None:
-                to_lamp = self._to_lamp(si, ray, to_lamp, on_surface & visible)
+                division = self.lamps.at(self.lamps.turning(si, si.bsdf(), active), ds.emitter)
+                to_lamp = to_lamp.sliding(si, ray.d, division, on_surface & visible)
+                elsewhere, change = division.at_infinity(ds.d)
             y = to_lamp.y
-            direction = dr.select(on_surface, to_lamp.ω, ds.d)
+            direction = dr.select(on_surface, to_lamp.ω, elsewhere)
             # Lights at infinity: the direction is fixed.
             attached = y.emitter(scene).eval(y, on_surface & visible) * (to_lamp.geometry / ds.pdf)
             if self.any_elsewhere:
                 # By `eval`: the `eval_direction` of `envmap` does not notice that the environment turns (Mitsuba 3.9).
                 seen = dr.zeros(mi.SurfaceInteraction3f, dr.width(ds.d))
-                seen.wi, seen.wavelengths, seen.time = -ds.d, si.wavelengths, si.time
-                elsewhere = ds.emitter.eval(seen, active & ~on_surface & ~ds.delta) / ds.pdf
-                attached = dr.select(on_surface, attached, elsewhere)
+                seen.wi, seen.wavelengths, seen.time = -elsewhere, si.wavelengths, si.time
+                from_there = ds.emitter.eval(seen, active & ~on_surface & ~ds.delta) * (change / ds.pdf)
+                attached = dr.select(on_surface, attached, from_there)
             if self.any_delta or self.several:
                 # A point of a disc follows it.
                 follows = ds.delta | self._of_several(ds.emitter)
@@ -312,22 +315,24 @@ class Scattering:
         """
         on_surface = active & pi.is_valid()
         to_y = to_lamp = self.held.connect(si, pi, ray, on_surface, by_light=False)
+        elsewhere, change = ray.d, mi.Float(1)
         if self.lamps is not None:
-            to_lamp = self._to_lamp(si, ray, to_y, on_surface)
-        joined, weights = [to_lamp], []
+            emitter = to_y.y.emitter(self.scene, active)
+            division = self.lamps.at(self.lamps.turning(si, bsdf, active & rough), emitter)
+            to_lamp = to_y.sliding(si, ray.d, division, on_surface & rough)
+            elsewhere, change = division.at_infinity(ray.d)
+            to_lamp.y.wi = dr.select(on_surface, to_lamp.y.wi, dr.replace_grad(to_lamp.y.wi, -elsewhere))
+        joined = [(to_lamp, elsewhere, change)]
         if vicinity is not None:
-            joined.append(to_y.sliding(si, ray.d, vicinity.around(bsdf), on_surface & rough))
-        for to in joined:
-            ω = dr.select(on_surface, to.ω, ray.d)
+            near = Division(vicinity.around(bsdf))
+            joined.append((to_y.sliding(si, ray.d, near, on_surface & rough), ray.d, mi.Float(1)))
+        weights = []
+        for to, elsewhere, change in joined:
+            ω = dr.select(on_surface, to.ω, elsewhere)
             f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active & rough)
-            f *= dr.select(on_surface, to.geometry, 1) / pdf
+            f *= dr.select(on_surface, to.geometry, change) / pdf
             weights.append(dr.select(to.still, dr.detach(f), f))
         return to_lamp, dr.select(on_surface, to_lamp.ω, ray.d), weights[0], weights[-1]
-
-    def _to_lamp(self, si, ray, to_y: Connection, active) -> Connection:
-        """What joins `si` to a point of a lamp, which slides near `CloseLamps`."""
-        emitter = to_y.y.emitter(self.scene, active)
-        return to_y.sliding(si, ray.d, self.lamps.vicinity(emitter), active)
 
     def stops(self, ray, pi, sampler, active) -> mi.Bool:
         """Does a ray meet a surface that it does not go through as if nothing was there?"""

@@ -12,7 +12,7 @@ from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.light_choice import LightChoice
-from rimlight.edge_sampling.close_lamps import CloseLamps
+from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
 from rimlight.edge_sampling.rays import spawn_ray
 
@@ -47,7 +47,7 @@ class PathTracer:
 
     #: See `Scattering`.
     lights: LightChoice | None = None
-    lamps: CloseLamps | None = None
+    lamps: DividedLight | None = None
 
     #: See `rimlight.edge_sampling.boundaries.tracer.Tracer`.
     shares_directions = True
@@ -166,11 +166,15 @@ class PathTracer:
         vertex = camera_vertex(ray, pi)
         if not self.scatters(2):
             si, no = seen_by_camera(self.scene, ray, pi, pi.is_valid(), attached=True), mi.Bool(False)
-            still = Vicinity(mi.Float(0))
-            return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0)), None
+            still, turning = Vicinity(mi.Float(0)), None
+            if self.lamps is not None:
+                with dr.resume_grad():
+                    turning = self.lamps.turning(si, si.bsdf(), pi.is_valid())
+            return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0), turning), None
         depths = replace(self.depths, max_depth=self.depths.max_depth - beyond)
-        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass)
-        return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, c.since < c.depth, c.vicinity, c.density), c
+        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass, self.lamps)
+        moves = c.since < c.depth, c.vicinity
+        return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, *moves, c.density, c.turning), c
 
     def scattered(
         self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.close_lamps import CloseLamps
+from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera, shown_by_mirror
 from rimlight.edge_sampling.rays import lift, spawn_ray
 
@@ -28,6 +28,7 @@ from .emission import Around
 from .found_light import LightEnd
 from .paths import Vertex
 from .replay import FLAGS, Chain, Start, derivatives, leaves
+from .scattering import Scattering
 from .vertex_table import VertexTable
 
 
@@ -67,7 +68,7 @@ class WholePaths:
         seen: mi.PreliminaryIntersection3f,
         joined: mi.Bool,
         glass: bool,
-        lamps: CloseLamps | None,
+        lamps: DividedLight | None,
         around: Around,
     ):
         self.joined = joined
@@ -78,6 +79,7 @@ class WholePaths:
         self.seen = mi.PreliminaryIntersection3f(seen)
         self.chain = Chain(scene, Vicinity.of(seen, glass), lamps=lamps)
         self.scattering = self.chain.scattering
+        self.lamps = lamps
         self.delta = mi.has_flag(end.emitter.flags(), mi.EmitterFlags.Delta)
         self.L = L
         if self.scattering.any_mirror:
@@ -140,15 +142,18 @@ class WholePaths:
         """The first vertex, which the camera ray meets, and what moves the second."""
         si = seen_by_camera(self.scene, ray, self.seen, self.active, attached=True)
         at_light = self.active & (self.n == 0)
-        factor, moving = self._factor(mi.UInt32(1), si, self.active & ~at_light)
+        scattering = Scattering(self.scene, attached=True, lamps=self.lamps)
+        factor, moving = self._factor(scattering, mi.UInt32(1), si, self.active & ~at_light)
         with dr.resume_grad():
             emitted = si.emitter(self.scene).eval(si, at_light)
             self.start = Start(moving.o, moving.d, dr.select(at_light, relative(emitted), factor))
 
-    def _factor(self, k: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Ray3f]:
+    def _factor(
+        self, scattering: Scattering, k: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Ray3f]:
         """What vertex k does to the light, over its present value; and the ray from there to the next one, as it moves
         with `si`."""
-        scattering, last, active = self.scattering, active & (k == self.n), active & (k <= self.n)
+        last, active = active & (k == self.n), active & (k <= self.n)
         bsdf, going = si.bsdf(), active & ~last
         beyond, one = self._vertex(k + 1, going), mi.Float(1)
         ds = self._light(si)
@@ -159,7 +164,7 @@ class WholePaths:
             _, _, _, onwards = scattering.throughput(
                 si, bsdf, beyond.ray, beyond.pi, one, self.chain.vicinity, going, ~mirrored
             )
-            arriving = self._reflected_light(si, bsdf, ds, last & ~mirrored)
+            arriving = self._reflected_light(scattering, si, bsdf, ds, last & ~mirrored)
             factor = dr.select(last, arriving, onwards)
             moving = mi.Ray3f(beyond.ray)
             moving.o = dr.replace_grad(beyond.ray.o, si.p)
@@ -171,10 +176,10 @@ class WholePaths:
                 moving.d = dr.replace_grad(beyond.ray.d, dr.select(mirrored, si.to_world(wo), beyond.ray.d))
             return relative(factor), moving
 
-    def _reflected_light(self, si, bsdf, ds, active) -> mi.Spectrum:
+    def _reflected_light(self, scattering: Scattering, si, bsdf, ds, active) -> mi.Spectrum:
         """What arrives from the light, as `si` reflects it."""
         sampled = lambda active: ds.emitter.sample_direction(si, mi.Point2f(0.5), active)
-        direction, arriving, visible, to_lamp = self.scattering.attach_light(si, ds, sampled, active)
+        direction, arriving, visible, to_lamp = scattering.attach_light(si, ds, sampled, active)
         f = bsdf.eval(mi.BSDFContext(), si, si.to_local(direction), active)
         L = dr.select(visible, f * arriving, 0)
         return dr.select(to_lamp.still, dr.detach(L), L)
@@ -200,7 +205,7 @@ class WholePaths:
                 dr.set_grad(o, δo)
                 dr.set_grad(d, δd)
             si = self.chain.surface(vertex, o, d, active)
-            factor, moving = self._factor(k, si, active)
+            factor, moving = self._factor(self.scattering, k, si, active)
             with dr.resume_grad():
                 δfactor, δo, δd = derivatives(factor, moving.o, moving.d)
             return k + 1, total + dr.select(active, δfactor, 0), δo, δd
@@ -224,7 +229,7 @@ class WholePaths:
             vertex = self._vertex(k, active)
             o, d = leaves(vertex.ray.o, vertex.ray.d)
             si = self.chain.surface(vertex, o, d, active)
-            factor, moving = self._factor(k, si, active)
+            factor, moving = self._factor(self.scattering, k, si, active)
             with dr.resume_grad():
                 value = dr.sum(δ * factor) + dr.dot(δo, moving.o) + dr.dot(δd, moving.d)
                 dr.backward_from(dr.select(active, value, 0), flags=FLAGS)

@@ -11,9 +11,10 @@ import pytest
 import touching_lamps
 from both_modes import assert_backward_is_forward
 from building import diffuse, horizontal, light, scene
+from one_derivative import assert_same_derivative
 from random_scenes import ball
 
-from rimlight.checks import FiniteDifferences, Motion, compare, derivative_image
+from rimlight.checks import FiniteDifferences, Motion, compare
 from rimlight.edge_sampling import close_lamps
 from rimlight.edge_sampling.close_lamps import CloseLamps
 
@@ -77,15 +78,5 @@ def test_paths_from_both_ends():
     ids=["strip", "window", "bulb", "board"],
 )
 def test_any_radius_gives_the_same_derivative(make, motion, radii, monkeypatch):
-    """Points of the lamp held far from it, or nowhere. What the camera sees of the lamp is left out."""
-    images = []
-    for radius in radii:
-        monkeypatch.setattr(close_lamps, "RADIUS", radius)
-        room, integrator = make(), mi.load_dict({"type": "direct_edge", "sppp": 0})
-        moves = Motion(room, **motion)
-        images.append(np.array([derivative_image(room, integrator, moves, spp=64, seed=i) for i in range(12)], float))
-    both = sum(i.mean(0) for i in images) / 2
-    scales = [(i * both).sum((1, 2, 3)) / (both**2).sum() for i in images]
-    error = sum(s.var(ddof=1) / len(s) for s in scales) ** 0.5
-    assert error < 0.02
-    assert abs(scales[0].mean() - scales[1].mean()) < 4 * error
+    """Points of the lamp held far from it, or nowhere."""
+    assert_same_derivative(make, motion, monkeypatch, "rimlight.edge_sampling.close_lamps.RADIUS", radii)

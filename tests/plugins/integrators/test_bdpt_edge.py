@@ -9,6 +9,7 @@ import cases
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import polished
 import pytest
 import rooms
 import touching_lamps
@@ -141,6 +142,7 @@ def test_image_is_that_of_bdpt():
         (cases.room(), "light.to_world"),
         (cases.cube(), "cube.vertex_positions"),
         (touching_lamps.window, "sensor.to_world"),
+        (polished.wall, "wall.vertex_positions"),
     ],
 )
 def test_frozen(scene, key):

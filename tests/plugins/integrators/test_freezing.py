@@ -7,6 +7,7 @@ import cases
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import polished
 import pytest
 import random_scenes
 import touching_lamps
@@ -43,6 +44,7 @@ VALUES = [
     ("strip", "left.vertex_positions"),
     ("window", "sensor.to_world"),
     ("bulb", "ball.to_world"),
+    ("polished", "floor.vertex_positions"),
 ]
 SCENES = {
     "two_triangles": cases.two_triangles,
@@ -55,6 +57,7 @@ SCENES = {
     "strip": touching_lamps.strip,
     "window": touching_lamps.window,
     "bulb": touching_lamps.bulb,
+    "polished": polished.floor,
     "fisheye": cases.room(cases.fisheye),
     "batch": cases.room(cases.batch),
 }

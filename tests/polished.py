@@ -1,0 +1,72 @@
+"""Polished surfaces, of which the highlights are narrow, and what changes in their scenes."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
+
+
+def metal(alpha: float) -> dict:
+    return {"type": "twosided", "bsdf": {"type": "roughconductor", "material": "none", "alpha": alpha}}
+
+
+def lacquer(alpha: float) -> dict:
+    colour = {"type": "rgb", "value": [0.3, 0.2, 0.1]}
+    return {"type": "roughplastic", "alpha": alpha, "diffuse_reflectance": colour}
+
+
+def cube(name: str, size: float, at, **props) -> mi.Mesh:
+    return mesh(name, size * cube_vertices() + at, CUBE_FACES, **props)
+
+
+def floor(bsdf: dict | None = None) -> mi.Scene:
+    """A lamp behind a cube, and a polished floor that shows both."""
+    lamp = quad((-0.6, 0.9, 1.6), (0, 0.7, 0), (1.2, 0, 0), "lamp", bsdf=diffuse(0.0), emitter=light(3, 2.5, 2))
+    return scene(
+        sensor=camera((0.3, 1.2, -2.2), (0, 0, 0.2)),
+        floor=horizontal((0, 0, 0), 1.5, "floor", bsdf=bsdf or metal(0.03)),
+        cube=cube("cube", 0.16, (-0.15, 0.45, 0.7), bsdf=diffuse(0.3)),
+        lamp=lamp,
+    )
+
+
+def table() -> mi.Scene:
+    """The same with lacquer, which reflects diffusely, too."""
+    return floor(lacquer(0.05))
+
+
+def sky() -> mi.Scene:
+    """A polished floor and a black cube under the sky."""
+    return scene(
+        sensor=camera((0.3, 1.2, -2.2), (0, 0, 0.2)),
+        floor=horizontal((0, 0, 0), 1.5, "floor", bsdf=metal(0.05)),
+        cube=cube("cube", 0.16, (-0.15, 0.45, 0.7), bsdf=diffuse(0.0)),
+        sky=constant(1.0),
+    )
+
+
+def wall() -> mi.Scene:
+    """A matt floor reflects what a polished wall shows of a lamp: narrow lobes behind the first vertex."""
+    lamp = quad((-0.9, 0.3, -0.9), (0, 0.5, 0), (0, 0, 0.5), "lamp", bsdf=diffuse(0.0), emitter=light(6, 5, 4))
+    return scene(
+        sensor=camera((0.3, 1.2, -2.2), (0, 0, 0.2)),
+        floor=horizontal((0, 0, 0), 1.5, "floor", bsdf=diffuse(0.6)),
+        wall=quad((-1, 0, 0.9), (0, 1.2, 0), (2, 0, 0), "wall", bsdf=metal(0.05)),
+        lamp=lamp,
+    )
+
+
+CAMERA_ALONG = {"key": "sensor.to_world", "direction": [1, 0, 0]}
+FLOOR_TILTS = {"key": "floor.vertex_positions", "rotate": [0.2, 0, 1]}
+LAMP_ALONG = {"key": "lamp.vertex_positions", "direction": [1, 0.3, 0]}
+WALL_TILTS = {"key": "wall.vertex_positions", "rotate": [0.3, 1, 0]}
+
+#: Of each case: scene, motion, step, longest path.
+POLISHED = {
+    "polished_camera": (floor, CAMERA_ALONG, 5e-3, 2),
+    "polished_lamp": (floor, LAMP_ALONG, 5e-3, 2),
+    "polished_floor": (floor, FLOOR_TILTS, 3e-3, 4),
+    "polished_wall": (wall, WALL_TILTS, 3e-3, 3),
+    "polished_sky": (sky, CAMERA_ALONG, 5e-3, 2),
+    "lacquer_camera": (table, CAMERA_ALONG, 5e-3, 2),
+}
