@@ -47,6 +47,8 @@ class CloseLamps:
         return CloseLamps(radii) if radii else None
 
     def __init__(self, radii: dict[mi.Emitter, float]):
+        #: The lamps.
+        self.shapes = [e.get_shape() for e in radii]
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]) for e in radii]
         #: Number that Dr.Jit gives to the first of them.
         self.first = min(numbers)

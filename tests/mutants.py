@@ -311,10 +311,10 @@ MUTANTS = [
         "& ~self.slides",
     ),
     mutant(
-        "close lamps: shadows that are found from them are those of their whole light",
-        SHADOWS,
-        "Le *= tracer.lamps.vicinity(light.emitter).far(r2)",
-        "Le *= 1",
+        "close lamps: shadows that are found from them move as if points of them were held",
+        "edge_sampling/boundaries/near_lamps.py",
+        "return slid * (",
+        "return 0 * slid * (",
     ),
     mutant(
         "close lamps: their own outlines are no boundaries",

@@ -35,6 +35,7 @@ from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .indirect_shadows import is_bent, share
 from .lune import Lune, spreads
+from .near_lamps import share_at_first
 from .tracer import ShadingPoint, Tracer
 
 #: Directions that are sampled from a BSDF, to find its peak.
@@ -157,11 +158,11 @@ class ShadingBoundary:
                 which is sought everywhere, and where both sides of edges close by count. And about what it contributes
                 if nothing hides it."""
                 vicinity = Vicinity(dr.select(emitted, to_lamp.radius, radius))
-                towards = replace(
-                    view,
-                    cone=Cone(cone.axis, dr.select(emitted, cone.cos, -1), cone.sin),
-                    vicinity=vicinity if tracer.scatters(2) or tracer.lamps is not None else None,
-                )
+                # Of the edges whose faces are both seen, emitted light counts only those on the borders of close lamps,
+                # which the tree takes for open ones.
+                ball = Vicinity(dr.select(emitted, 0, radius)) if tracer.scatters(2) else None
+                cos = dr.select(emitted, cone.cos, -1)
+                towards = replace(view, cone=Cone(cone.axis, cos, cone.sin), vicinity=ball)
                 # What is seen past an edge that stands still may move. What emits does not: else all would be in one
                 # group.
                 still = dr.select(moves | point.slides, 1, dr.select(emitted, 0, STILL))
@@ -260,7 +261,7 @@ class ShadingBoundary:
             ray, pi, y, hidden, own = see(side, active)
             active &= ~hidden & (past | own)
             shines = active & emission & (past | (near > 0))
-            L, from_lamp = self._emitted(scene, point, y, ω, pdf, distance, shines, light, past & ~outline.is_line)
+            L = self._emitted(tracer, point, y, ω, pdf, distance, shines, light, past & ~outline.is_line)
             valid = active & y.is_valid()
             again, lune, faces = sampler.clone(), None, mi.Spectrum(0)
             if tracer.scatters(2):
@@ -280,7 +281,7 @@ class ShadingBoundary:
                 # What its own faces show, held in its direction in the vicinity.
                 faces = dr.select(of_faces, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)
-            L, from_lamp = (dr.select(active & past, f * light, 0) for light in (L, from_lamp))
+            L = dr.select(active & past, f * L, 0)
             n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
@@ -289,11 +290,7 @@ class ShadingBoundary:
             edge = turning(n_dl, p - x, active)
             d = material_point(ray, pi, valid).p - x
             far = vicinity.far(dr.detach(dr.squared_norm(d)))
-            value = -side * L * (edge - far * turning(n_dl, d, valid)) + faces * edge
-            if tracer.lamps is not None:
-                # From lamps, only the part is found that is held at their points.
-                value -= side * from_lamp * dr.select(valid, 1 - far, 0) * edge
-            return value
+            return -side * L * (edge - far * turning(n_dl, d, valid)) + faces * edge
 
     def _shown_by_faces(
         self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune
@@ -320,14 +317,14 @@ class ShadingBoundary:
         return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, 2 * n_dl, n_dl)
 
     def _emitted(
-        self, scene, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """Light that one light emits at y towards a point: the part of which shadows are found from the point; and the
-        part of which they are found from the light, if that is a material point. pdf : density of ω among samples of
-        the BSDF there. distance : of the edge. found_too : may the edge throw a shadow that is found from the light?"""
+        self, tracer, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
+    ) -> mi.Spectrum:
+        """Light that one light emits at y towards a point: the part of which shadows are found from the point. pdf :
+        density of ω among samples of the BSDF there. distance : of the edge. found_too : may the edge throw a shadow
+        that is found from the light?"""
         if not self.emission:
-            return mi.Spectrum(0), mi.Spectrum(0)
-        si, at_first = point.si, point.depth == 1
+            return mi.Spectrum(0)
+        scene, si, at_first = tracer.scene, point.si, point.depth == 1
         L, emitter = self._radiance(scene, y, light, active), y.emitter(scene, active)
         lit = active & (emitter == light)
         # Shadows that are found from the lights, too; all of those on what the sensor sees.
@@ -338,12 +335,12 @@ class ShadingBoundary:
         light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared | on_smooth)
         mis = power_heuristic(pdf, light_pdf)
         part = share(point.density, light_pdf, pdf, dr.abs_dot(si.n, ω), distance, y.t)
-        theirs = dr.select(at_first, 1 - mis if self.emission_at_first else 1, part)
-        theirs = dr.select(shared, theirs, 0)
+        first = share_at_first(tracer.lamps, light, distance, y.t, 1 - mis if self.emission_at_first else 1)
+        theirs = dr.select(shared, dr.select(at_first, first, part), 0)
         ours = L * (1 - theirs)
         if len(self.smooth_lamps):
             ours *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)
-        return ours, L * theirs
+        return ours
 
     def _radiance(self, scene: mi.Scene, y: mi.SurfaceInteraction3f, light: mi.EmitterPtr, active) -> mi.Spectrum:
         """What one light emits at y."""
