@@ -76,7 +76,7 @@ MUTANTS = [
         "normal_velocity = 1.02 * dr.dot(points.n_dl, points.velocity)",
     ),
     mutant("shadows from lights: 2 % too large", SHADOWS, "value = jump * dr.dot", "value = 1.02 * jump * dr.dot"),
-    mutant("edges from points: 2 % too large", SHADING, "value = -side * L", "value = -1.02 * side * L"),
+    mutant("edges from points: 2 % too large", SHADING, "return -side * L", "return -1.02 * side * L"),
     mutant(
         "planes of faces: twice as large",
         "edge_sampling/boundaries/face_planes.py",
