@@ -48,6 +48,8 @@ class CloseLamps:
         return CloseLamps(radii) if radii else None
 
     def __init__(self, radii: dict[mi.Emitter, float]):
+        #: The lamps.
+        self.shapes = [e.get_shape() for e in radii]
         self.radii = EmitterTable(radii)
 
     def vicinity(self, emitter: mi.EmitterPtr) -> Vicinity:

@@ -57,6 +57,12 @@ class DividedLight:
         for light that is held at its points."""
         return None if self.close is None else DividedLight(self.close, None)
 
+    @property
+    def shapes(self) -> list[mi.Shape]:
+        """The lamps of which a part is held in its direction: their borders with other shapes are boundaries."""
+        close = [] if self.close is None else self.close.shapes
+        return close if self.lobes is None else [*close, *self.lobes.lamps]
+
     def near(self, emitter: mi.EmitterPtr) -> Vicinity:
         """That in which directions to an emitter are held, whatever scatters the light."""
         return Vicinity(mi.Float(0)) if self.close is None else self.close.vicinity(emitter)
@@ -84,6 +90,7 @@ class NarrowLobes:
     sizes : of the emitters whose light is held in its direction there, the root of their areas; infinite, if they are
         infinitely far away. (Lamps with textures or interpolated normals have more edges than their outline, and are
         none of them.)
+    lamps : those of them that are shapes.
     """
 
     DRJIT_STRUCT = dict.fromkeys(("sizes",))  # for `dr.freeze`
@@ -99,11 +106,11 @@ class NarrowLobes:
         if not sizes:
             return None
         moves = surfaces(scene) if moving is None else [inner(s) for s in moving]
-        lobes = NarrowLobes(EmitterTable(sizes))
+        lobes = NarrowLobes(EmitterTable(sizes), [e.get_shape() for e, size in sizes.items() if size < np.inf])
         return lobes if any(lobes.found_in(b) for b in dict.fromkeys(s.bsdf() for s in moves)) else None
 
-    def __init__(self, sizes: EmitterTable):
-        self.sizes = sizes
+    def __init__(self, sizes: EmitterTable, lamps: list[mi.Shape]):
+        self.sizes, self.lamps = sizes, lamps
 
     def found_in(self, bsdf: mi.BSDF | None) -> bool:
         """Has a BSDF a narrow lobe anywhere?"""

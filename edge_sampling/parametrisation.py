@@ -263,12 +263,6 @@ class Division:
     vicinity: Vicinity
     turning: Turning | None = None
 
-    def anywhere(self, *, turning: bool) -> Vicinity:
-        """The ball in which directions are held, whichever they are. turning : those that turn, too?"""
-        if self.turning is None or not turning:
-            return self.vicinity
-        return Vicinity(dr.select(self.turning.anywhere, dr.inf, self.vicinity.radius))
-
     def held(self, r2: mi.Float, ω: mi.Vector3f) -> mi.Float:
         """Part of the light from the squared distance `r2` and the direction ω that is held at the material point. It
         may be attached."""
@@ -279,9 +273,13 @@ class Division:
         """The same, from infinitely far away: there, it is the part of which directions do not turn."""
         return mi.Float(1) if self.turning is None else 1 - self.turning.part(ω)
 
+    def turns(self, r2: mi.Float, ω: mi.Vector3f) -> mi.Float:
+        """Part of it whose direction turns with a lobe."""
+        return mi.Float(0) if self.turning is None else self.turning.part(ω, r2)
+
     def held_beside(self, d: mi.Vector3f, ω: mi.Vector3f, valid: mi.Bool) -> mi.Float:
-        """The same of what a ray past an edge, in the direction ω, meets at the place d; or infinitely far away, if it
-        meets nothing. Detached."""
+        """Part that is held of what a ray past an edge, in the direction ω, meets at the place d; or infinitely far
+        away, if it meets nothing. Detached."""
         held = dr.select(valid, self.held(dr.squared_norm(d), ω), self.held_at_infinity(ω))
         return dr.detach(held)
 

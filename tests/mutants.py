@@ -76,7 +76,7 @@ MUTANTS = [
         "normal_velocity = 1.02 * dr.dot(points.n_dl, points.velocity)",
     ),
     mutant("shadows from lights: 2 % too large", SHADOWS, "value = jump * dr.dot", "value = 1.02 * jump * dr.dot"),
-    mutant("edges from points: 2 % too large", SHADING, "faces * edge - side * (", "faces * edge - 1.02 * side * ("),
+    mutant("edges from points: 2 % too large", SHADING, "- side * value", "- 1.02 * side * value"),
     mutant(
         "planes of faces: twice as large",
         "edge_sampling/boundaries/face_planes.py",
@@ -94,8 +94,8 @@ MUTANTS = [
     mutant(
         "edges from points: velocity of what is seen left out",
         SHADING,
-        "held * L * (edge - turning(n_dl, d, valid))",
-        "held * L * edge",
+        "(edge - held * turning(n_dl, d, valid)",
+        "(edge",
     ),
     mutant(
         "shadows from lights: motion of the light not followed",
@@ -311,10 +311,10 @@ MUTANTS = [
         "& ~self.slides",
     ),
     mutant(
-        "close lamps: shadows that are found from them are those of their whole light",
-        SHADOWS,
-        "Le *= tracer.lamps.at(turning, light.emitter).held(r2, ω_x)",
-        "Le *= 1",
+        "close lamps: shadows that are found from them move as if points of them were held",
+        "edge_sampling/boundaries/near_lamps.py",
+        "return slid * (",
+        "return 0 * slid * (",
     ),
     mutant(
         "close lamps: their own outlines are no boundaries",
@@ -325,14 +325,14 @@ MUTANTS = [
     mutant(
         "narrow lobes: shadows that are found from lamps are those of their whole light",
         SHADOWS,
-        "turning = tracer.lamps.turning(si, si.bsdf(), active) if self.at_first else None",
-        "turning = None",
+        "Le *= 1 - division.turns(r2, ω_x)",
+        "Le *= 1",
     ),
     mutant(
         "narrow lobes: boundaries do not turn with them",
         SHADING,
-        "edge += dr.dot(n_dl, dr.select(active, ω - division.turned(ω), 0))",
-        "edge += 0",
+        "turned = dr.dot(n_dl, dr.select(active, division.turned(ω) - ω, 0))",
+        "turned = 0",
     ),
     mutant(
         "narrow lobes: edges at points do not know how they turn, where light is scattered more than once",
@@ -355,7 +355,7 @@ MUTANTS = [
     mutant(
         "edges from points: only what is seen past silhouettes counts",
         SHADING,
-        "return faces * edge - side",
+        "return faces * (edge - turned) - side",
         "return -side",
     ),
     # ---------------------- Channels besides light ----------------------

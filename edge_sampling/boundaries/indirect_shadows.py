@@ -116,7 +116,7 @@ class IndirectShadows(ShadowBoundary):
         with dr.resume_grad():
             m = material_point(shadow.ray, shadow.fallen, view.active).p
             held = _held(z.p, m, x.n, join.ω, far, view.active)
-            return self._value(scene, placement, light, edge, shadow, met, m, held, jump, n_dl, view.active)
+            return self._value(scene, placement, light, edge, shadow, view, met, m, held, jump, n_dl)
 
     def onwards(
         self, tracer: Tracer, placement: Placement, point: ShadingPoint, sampler: mi.Sampler, choice: mi.Float
@@ -154,7 +154,7 @@ class IndirectShadows(ShadowBoundary):
             p_z = _held(w.p, material_point(ray, pi, active).p, z.n, to_z.ω, far_z, active)
             m = material_point(shadow.ray, shadow.fallen, active).p
             held = _held(p_z, m, x.n, join.ω, far, active)
-            return self._value(scene, placement, light, edge, shadow, met, m, held, jump, n_dl, active)
+            return self._value(scene, placement, light, edge, shadow, view, met, m, held, jump, n_dl)
 
     def _boundary(self, tracer: Tracer, light, edge, shadow, x, z, join: _Join):
         """The shadow as z sees it; what the ray to the light meets; the jump; and the normal of the curve, with its
@@ -172,11 +172,11 @@ class IndirectShadows(ShadowBoundary):
         view.active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
         return view, met, jump, dr.select(view.active, n_dl, 0)
 
-    def _value(self, scene, placement, light, edge, shadow, met, m, held, jump, n_dl, active) -> mi.Spectrum:
+    def _value(self, scene, placement, light, edge, shadow, view, met, m, held, jump, n_dl) -> mi.Spectrum:
         """m : the material point on which the shadow falls. held : the point as the path has it."""
-        x = self._moving(scene, placement, light, edge, shadow, m, met, active)
+        x = self._moving(scene, placement, light, edge, shadow, view, m, held, met)
         moved = (x - dr.detach(x)) - (held - dr.detach(held))
-        return jump * dr.dot(n_dl, dr.select(active, moved, 0))
+        return jump * dr.dot(n_dl, dr.select(view.active, moved, 0))
 
     def _chosen(
         self,

@@ -36,6 +36,7 @@ from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .indirect_shadows import is_bent, share
 from .lune import Lune, spreads
+from .near_lamps import share_at_first
 from .past_edges import look, turning
 from .tracer import ShadingPoint, Tracer
 
@@ -152,18 +153,18 @@ class ShadingBoundary:
                 [self._lobe(si, bsdf, sampler, active)] if self.glossy else [],
             )
             to_surface = Division(point.vicinity.around(bsdf))
-            both_sides = tracer.scatters(2) or tracer.lamps is not None
 
             def candidate(part, emitted, active, sampler):
                 """An edge for emitted light, which is sought in the directions of one light; or for scattered light,
                 which is sought everywhere, and where both sides of edges close by count. And about what it contributes
                 if nothing hides it."""
                 division = _either(emitted, to_lamp, to_surface)
-                towards = replace(
-                    view,
-                    cone=Cone(cone.axis, dr.select(emitted, cone.cos, -1), cone.sin),
-                    vicinity=division.anywhere(turning=self.silhouettes.joined_lamps) if both_sides else None,
-                )
+                # Of the edges whose faces are both seen, emitted light counts only those on the borders of lamps, which
+                # the tree takes for open ones.
+                radius = dr.select(emitted, 0, division.vicinity.radius)
+                ball = Vicinity(radius) if tracer.scatters(2) else None
+                cos = dr.select(emitted, cone.cos, -1)
+                towards = replace(view, cone=Cone(cone.axis, cos, cone.sin), vicinity=ball)
                 # What is seen past an edge that stands still may move. What emits does not: else all would be in one
                 # group.
                 still = dr.select(moves | point.slides, 1, dr.select(emitted, 0, STILL))
@@ -263,7 +264,7 @@ class ShadingBoundary:
             ray, pi, y, hidden, own = see(side, active)
             active &= ~hidden & (past | own)
             shines = active & emission & (past | (near > 0))
-            L, from_lamp = self._emitted(scene, point, y, ω, pdf, distance, shines, light, past & ~outline.is_line)
+            L, from_lamp = self._emitted(tracer, point, y, ω, pdf, distance, shines, light, past & ~outline.is_line)
             valid = active & y.is_valid()
             again, lune, faces = sampler.clone(), None, mi.Spectrum(0)
             if tracer.scatters(2):
@@ -292,11 +293,11 @@ class ShadingBoundary:
             edge = turning(n_dl, p - x, active)
             d = material_point(ray, pi, valid).p - x
             held = division.held_beside(d, ω, valid)
-            # Relative to the material point, and to the direction that is held.
-            past_point = held * L * (edge - turning(n_dl, d, valid))
-            edge += dr.dot(n_dl, dr.select(active, ω - division.turned(ω), 0))
-            # From lamps, only the part is found that is held at their points.
-            return faces * edge - side * (past_point + (1 - held) * (L + from_lamp) * edge)
+            turned = dr.dot(n_dl, dr.select(active, division.turned(ω) - ω, 0))
+            value = L * (edge - held * turning(n_dl, d, valid) - (1 - held) * turned)
+            # From lamps, shadows are found as if directions did not turn, and none of the part of which they do.
+            value += from_lamp * (dr.detach(division.turns(dr.squared_norm(d), ω)) * edge - (1 - held) * turned)
+            return faces * (edge - turned) - side * value
 
     def _shown_by_faces(
         self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune
@@ -323,14 +324,15 @@ class ShadingBoundary:
         return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, 2 * n_dl, n_dl)
 
     def _emitted(
-        self, scene, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
+        self, tracer, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
         """Light that one light emits at y towards a point: the part of which shadows are found from the point; and the
-        part of which they are found from the light, if that is a material point. pdf : density of ω among samples of
-        the BSDF there. distance : of the edge. found_too : may the edge throw a shadow that is found from the light?"""
+        part of which they are found from the light, as far as nothing turns with lobes. pdf : density of ω among
+        samples of the BSDF there. distance : of the edge. found_too : may the edge throw a shadow that is found from
+        the light?"""
         if not self.emission:
             return mi.Spectrum(0), mi.Spectrum(0)
-        si, at_first = point.si, point.depth == 1
+        scene, si, at_first = tracer.scene, point.si, point.depth == 1
         L, emitter = self._radiance(scene, y, light, active), y.emitter(scene, active)
         lit = active & (emitter == light)
         # Shadows that are found from the lights, too; all of those on what the sensor sees.
@@ -341,8 +343,8 @@ class ShadingBoundary:
         light_pdf = scene.pdf_emitter_direction(si, mi.DirectionSample3f(scene, y, si), shared | on_smooth)
         mis = power_heuristic(pdf, light_pdf)
         part = share(point.density, light_pdf, pdf, dr.abs_dot(si.n, ω), distance, y.t)
-        theirs = dr.select(at_first, 1 - mis if self.emission_at_first else 1, part)
-        theirs = dr.select(shared, theirs, 0)
+        first = share_at_first(tracer.lamps, light, distance, y.t, 1 - mis if self.emission_at_first else 1)
+        theirs = dr.select(shared, dr.select(at_first, first, part), 0)
         ours = L * (1 - theirs)
         if len(self.smooth_lamps):
             ours *= dr.select(on_smooth, self.smooth_lamps.cosine(y, ω, 1 - mis) / dr.abs_dot(y.n, ω), 1)

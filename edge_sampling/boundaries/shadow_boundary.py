@@ -10,14 +10,15 @@ The derivative for the whole light is the mean over its points. Where the light 
 all there is (Li et al. 2018 leave such lights out); where it has a size, the same boundary can be found from the
 shading points (`shading_boundary.py`), and what both find is divided between them.
 
-The point of the light is a *material point*, as it is for the interior derivative: it moves with the light. Of the
-light of `CloseLamps`, this is the part that is held at the material point; the rest is found from the shading points.
+The point of the light is a *material point*, as it is for the interior derivative: it moves with the light. Near
+`CloseLamps`, it moves as far as the interior derivative has it: see `parametrisation.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -33,6 +34,7 @@ from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 from rimlight.edge_sampling.rays import spawn_ray
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
+from .near_lamps import moved_with, share_at_first, still_on_film
 from .tracer import Tracer
 
 #: Of spots that are wider, degrees, edges are sought in all directions.
@@ -124,7 +126,11 @@ class ShadowBoundary:
             edge = self._edge(placement, light, sampler)
             shadow = fall(tracer.scene, light, edge)
             view = _look(tracer, projection, sensor, sampler, light.time, shadow)
-            met, jump, active = self._arriving(tracer, light, edge, shadow, view, power_heuristic if share else None)
+            near, whole = dr.norm(edge.p - view.si.p), dr.norm(light.y - view.si.p)
+            part = partial(share_at_first, tracer.lamps, light.emitter, near, whole)
+            ours = (lambda *pdfs: part(power_heuristic(*pdfs))) if share else None
+            met, jump, active = self._arriving(tracer, light, edge, shadow, view, ours)
+            jump *= 1 if share else part(1)
 
             # ---------------------- The boundary on the film ----------------------
 
@@ -138,28 +144,38 @@ class ShadowBoundary:
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl = dr.select(active, n_dl, 0)
+            view.active = active
             u = dr.select(active, view.u, 0)  # what is not finite would spoil pixels, even with the value 0
             if projection.attached:
                 # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
                 kept = (light.light, light.numbers, light.y, light.far, edge.sample, shadow.facing, shadow.lift)
-                dr.eval(jump, n_dl, active, view.seen, view.ray, met, shadow.onwards, kept, u)
+                dr.eval(jump, n_dl, active, view.seen, view.ray, met, shadow.onwards, kept, view.slid, u)
 
         with dr.resume_grad():
             m = material_point(view.ray, view.seen, active).p
-            x = self._moving(tracer.scene, placement, light, edge, shadow, m, met, active)
+            held = m
+            if view.slid is not None:
+                held = still_on_film(projection, m, shadow.facing, view.aperture_sample, active)
+            x = self._moving(tracer.scene, placement, light, edge, shadow, view, m, held, met)
             moved = projection.film(x, view.aperture_sample).position()
             value = jump * dr.dot(n_dl, dr.select(active, moved - dr.detach(moved), 0))
             return ShadowSamples(u, value, view.ray.wavelengths, light.light)
 
-    def _moving(self, scene, placement: Placement, light, edge, shadow, m: mi.Point3f, met, active) -> mi.Point3f:
+    def _moving(
+        self, scene, placement: Placement, light, edge, shadow, view, m: mi.Point3f, held: mi.Point3f, met
+    ) -> mi.Point3f:
         """Where the shadow falls, attached to the light, the edge, and the material point m of what it falls on.
 
-        met : what the ray from there to the light meets.
+        held : the point of that which is lit, as the interior term has it. met : what the ray from there to the light
+        meets.
         """
         # To the plane in which the shadow falls. (Its turning is of second order.)
-        origin, d = self._past(scene, placement, light, edge, shadow, met, active)
+        origin, d = self._past(scene, placement, light, edge, shadow, met, view.active)
+        if view.slid is not None:
+            more = moved_with(held, origin, view.slid)
+            origin, d = origin + more, d - more
         s = (dr.dot(shadow.facing, m - origin) + shadow.lift) / dr.dot(shadow.facing, d)
-        return mi.Point3f(origin + dr.select(active, s, 1) * d - shadow.facing * shadow.lift)
+        return mi.Point3f(origin + dr.select(view.active, s, 1) * d - shadow.facing * shadow.lift)
 
     def _past(
         self, scene: mi.Scene, placement: Placement, light: LightPoint, edge: LitEdge, shadow: Shadow, met, active
@@ -291,9 +307,11 @@ class ShadowBoundary:
             r2 = dr.squared_norm(to_light)
             Le = light.emitter.eval(on_light, emitting) * (cos / r2)
             if tracer.lamps is not None:
-                # Only the part of its light that is held at the point of the lamp.
                 turning = tracer.lamps.turning(si, si.bsdf(), active) if self.at_first else None
-                Le *= tracer.lamps.at(turning, light.emitter).held(r2, ω_x)
+                division = tracer.lamps.at(turning, light.emitter)
+                view.slid = 1 - division.vicinity.far(r2)
+                # What turns with lobes is found from what is lit.
+                Le *= 1 - division.turns(r2, ω_x)
             L = dr.select(on_surface, Le * mis, L)
         return met, dr.select(active, f * L * view.weight, 0), active
 
@@ -359,7 +377,10 @@ class Shadow:
 
 @dataclass
 class SeenShadow:
-    """The shadow as the sensor sees it: at the position u of the film, in pixels."""
+    """The shadow as the sensor sees it: at the position u of the film, in pixels.
+
+    slid : part of the light that is held in its direction; None: nothing.
+    """
 
     u: mi.Point2f
     ray: mi.RayDifferential3f
@@ -368,6 +389,7 @@ class SeenShadow:
     si: mi.SurfaceInteraction3f
     aperture_sample: mi.Point2f | None
     active: mi.Bool
+    slid: mi.Float | None = None
 
 
 def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:

@@ -104,6 +104,7 @@ class EdgeTree:
     geometry : the meshes.
     edges : their edges, on the host.
     groups : indices into `edges`, a tree for each; without the empty ones.
+    always : (E,), bool, which edges count from wherever they are seen, besides open ones; None: no others.
     """
 
     _NUMBERS = ("leaf_size", "leaves", "bottoms", "device_node_offsets", "device_leaf_offsets")
@@ -111,7 +112,7 @@ class EdgeTree:
         ("device_edges", "centre", "slot_edge", "_used", "_open", "nodes", "slots", *_NUMBERS)
     )
 
-    def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray]):
+    def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray], always: np.ndarray | None = None):
         self.geometry = geometry
         self.device_edges = DeviceEdges(edges, geometry)
         position = geometry.host_positions()
@@ -137,7 +138,8 @@ class EdgeTree:
         slot = np.concatenate(slots).reshape(-1)
         self.slot_edge = mi.UInt32(np.maximum(slot, 0).astype(np.uint32))
         self._used = mi.Bool(slot >= 0)
-        self._open = mi.Bool(edges.count[np.maximum(slot, 0)] != 2)
+        always = edges.count != 2 if always is None else (edges.count != 2) | always
+        self._open = mi.Bool(always[np.maximum(slot, 0)])
         #: An array for each packet: several scatters to one array would be as many kernels.
         self.nodes = _zeros(NODE_PACKETS, self.node_offsets[-1])
         self.slots = _zeros(SLOT_PACKETS, self.leaf_offsets[-1] * LEAF)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -90,6 +91,7 @@ class Silhouettes:
     geometry : the shapes.
     edges : their edges, on the host.
     moving : see `Geometry.moving`. None: take all as moving.
+    lamps : shapes whose borders with other shapes count from wherever they are seen: see `DividedLight`.
 
     Moving edges are a group of their own, so that viewers that stand still need not look at the others.
     """
@@ -97,7 +99,9 @@ class Silhouettes:
     _NUMBERS = ("count", "groups", "centre", "_first_line", "_still")
     DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", *_NUMBERS))  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None):
+    def __init__(
+        self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None, lamps: Sequence[mi.Shape] = ()
+    ):
         self.geometry = geometry
         #: In which shapes cut through each other; they are the last edges.
         self.lines = geometry.lines
@@ -107,13 +111,10 @@ class Silhouettes:
         if moving is not None:
             moves = edges.is_line | np.array(moving, bool)[edges.mesh].any(axis=1)
         self._still = mi.Bool(~moves)
-        emits = np.array([s.is_emitter() for s in (*geometry.meshes, *geometry.analytic)], bool)[edges.mesh]
-        #: Do lamps share edges with what does not emit?
-        self.joined_lamps = bool(geometry.joints) or bool((emits[:, 0] != emits[:, 1])[~edges.is_line].any())
         groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         #: Number of groups of edges.
         self.groups = len(groups)
-        self.tree = EdgeTree(geometry, edges, groups) if groups else None
+        self.tree = EdgeTree(geometry, edges, groups, _borders(geometry, edges, lamps)) if groups else None
         self.curves = Curves(geometry.analytic, geometry.joints) if geometry.analytic else None
         self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
 
@@ -268,3 +269,12 @@ class Silhouettes:
         inwards = tuple(choose(x, y) for x, y in zip(point.inwards, on_curve.inwards, strict=True))
         p, tangent = choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent)
         return OutlinePoint(p, tangent, inwards, point.is_line & on_edge, c.slides & ~on_edge)
+
+
+def _borders(geometry: Geometry, edges: Edges, lamps: Sequence[mi.Shape]) -> np.ndarray | None:
+    """Which edges are between a lamp and another mesh: (E,), bool; None if there are no lamps."""
+    if not lamps:
+        return None
+    known = {int(s.ptr) for s in lamps}
+    is_lamp = np.array([int(m.ptr) in known for m in geometry.meshes] or [False])
+    return is_lamp[edges.mesh].any(axis=1) & (edges.mesh[:, 0] != edges.mesh[:, 1])

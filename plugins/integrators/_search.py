@@ -258,14 +258,15 @@ class BoundarySearch:
         if not sppi or not scene.emitters() or not self.depths.scatters(1):
             return None, None, (), None
         everything = moving.camera or moving.lights
-        silhouettes = Silhouettes(self.geometry, self._edges_and_lines, None if everything else moving.flags)
+        shapes = None if everything else list(moving.shapes)
+        lamps = DividedLight.of(scene, shapes) if self.from_points and not self.geometry.others else None
+        flags, divided = None if everything else moving.flags, lamps.shapes if lamps is not None else ()
+        silhouettes = Silhouettes(self.geometry, self._edges_and_lines, flags, divided)
         if not len(silhouettes):
             return None, None, (), None
-        shadows, shading, indirect, lamps = ShadowBoundary(scene, silhouettes), None, (), None
+        shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, ()
         if self.from_points:
-            shapes = None if everything else list(moving.shapes)
             shading = ShadingBoundary(scene, silhouettes, shapes)
-            lamps = None if self.geometry.others else DividedLight.of(scene, shapes)
             needed = self.depths.scatters(2) or shading.emission_at_first or lamps is not None
             shading = shading if needed else None
             kinds = (IndirectShadows, IndirectBeams) if self.depths.scatters(2) else ()

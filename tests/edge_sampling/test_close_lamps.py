@@ -14,9 +14,11 @@ from building import diffuse, horizontal, light, scene
 from one_derivative import assert_same_derivative
 from random_scenes import ball
 
-from rimlight.checks import FiniteDifferences, Motion, compare
+from rimlight.checks import FiniteDifferences, Motion, compare, derivative_image
 from rimlight.edge_sampling import close_lamps
+from rimlight.edge_sampling.boundaries import shading_boundary, shadow_boundary
 from rimlight.edge_sampling.close_lamps import CloseLamps
+from rimlight.terms.order import TERMS
 
 
 @pytest.mark.parametrize("make", [touching_lamps.strip, touching_lamps.window])
@@ -80,3 +82,25 @@ def test_paths_from_both_ends():
 def test_any_radius_gives_the_same_derivative(make, motion, radii, monkeypatch):
     """Points of the lamp held far from it, or nowhere."""
     assert_same_derivative(make, motion, monkeypatch, "rimlight.edge_sampling.close_lamps.RADIUS", radii)
+
+
+@pytest.mark.parametrize("motion", [touching_lamps.BALL_ALONG, touching_lamps.CAMERA_ALONG], ids=["lamp", "camera"])
+def test_shadows_are_the_same_from_lamps_and_from_points(motion, monkeypatch):
+    """Though the light of the lamp is mostly held in its direction. What else points find is subtracted."""
+    monkeypatch.setattr(close_lamps, "RADIUS", 3.0)
+    room = touching_lamps.bulb()
+    moves, integrator = Motion(room, **motion), mi.load_dict({"type": "direct_edge", "sppc": 0, "sppp": 0})
+
+    def images(term, part):
+        for module in (shading_boundary, shadow_boundary):
+            monkeypatch.setattr(module, "share_at_first", lambda *_: mi.Float(part))
+        integrator.TERMS = tuple(t for t in TERMS if t.name in ("interior", term))
+        return np.array([derivative_image(room, integrator, moves, spp=256, seed=i) for i in range(12)], float)
+
+    from_lamps = images("shadows from lights", 1.0)
+    from_points = images("edges from points", 0.0) - images("edges from points", 1.0)
+    both = (from_lamps.mean(0) + from_points.mean(0)) / 2
+    scales = [(i * both).sum((1, 2, 3)) / (both**2).sum() for i in (from_lamps, from_points)]
+    error = sum(s.var(ddof=1) / len(s) for s in scales) ** 0.5
+    assert error < 0.05
+    assert abs(scales[0].mean() - scales[1].mean()) < 4 * error
