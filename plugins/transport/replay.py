@@ -306,14 +306,15 @@ class MovingVertex:
         )
         return p, n, d
 
-    def schedule(self) -> None:
-        """Let the next evaluation find the gradients, in the kernel of what they come from."""
-        dr.schedule(dr.grad(self.p), dr.grad(self.n), dr.grad(self.d))
+    @property
+    def gradients(self) -> list:
+        """What `backward` hands on."""
+        return [dr.grad(self.p), dr.grad(self.n), dr.grad(self.d)]
 
     def backward(self) -> None:
         """Hand the gradients on to the surfaces, and to the camera rays."""
         chain, log = self.chain, self.log
-        δp, δn, δd = dr.grad(self.p), dr.grad(self.n), dr.grad(self.d)
+        δp, δn, δd = self.gradients
         dr.eval(δp, δn, δd)
 
         def bounce(depth, δp, δn, δd):
