@@ -399,9 +399,15 @@ def _numbers(numbers: tuple[float, ...], counts: set[int], name: str, expected: 
     return np.array(numbers, np.float64)
 
 
-def _large_steps(positions: Any, faces: np.ndarray, smoothing: float) -> Any:
-    triangles = mi.TensorXu(faces) if dr.is_tensor_v(positions) else mi.UInt(faces.ravel())
+def check_smoothing() -> None:
+    """InputError : the package is missing that smoothing needs."""
     try:
-        return mi.ad.LargeSteps(positions, triangles, smoothing)
+        import cholespy  # noqa: F401
     except ImportError as error:
         raise InputError("fit: smoothing needs the package cholespy: pip install cholespy") from error
+
+
+def _large_steps(positions: Any, faces: np.ndarray, smoothing: float) -> Any:
+    check_smoothing()
+    triangles = mi.TensorXu(faces) if dr.is_tensor_v(positions) else mi.UInt(faces.ravel())
+    return mi.ad.LargeSteps(positions, triangles, smoothing)

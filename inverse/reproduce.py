@@ -1,4 +1,4 @@
-"""The fits of Li et al. 2018, section 5, and five of our own, one after the other: `rimlight reproduce`.
+"""The fits of Li et al. 2018, section 5, and six of our own, one after the other: `rimlight reproduce`.
 
 Each is a scene and a TOML file in `rimlight.scenes`. Results that are there already are not made again, so that an
 interrupted run goes on where it was.
@@ -26,7 +26,7 @@ from rimlight.exr import replacing
 from rimlight.loading import one_line
 from rimlight.scenes import room, traffic_sign
 
-from . import classifier, report
+from . import classifier, free_parameters, report
 from . import problem as problems
 from .fitting import fit
 from .problem import Problem
@@ -50,6 +50,7 @@ EXPERIMENTS = {
     "box_in_sand": "Pose of a box that is sunk into sand",
     "lampshade": "Place of a lamp inside of its shade, from the room that it lights",
     "caustic": "Pose of a bent sheet of metal, from the light that it throws on a table",
+    "caustic_shape": "Shape of a bent sheet of metal, from the light that it throws on a table",
 }
 
 FIGURES = {"fig6": tuple(name for name in EXPERIMENTS if name.startswith("fig6")), "all": tuple(EXPERIMENTS)}
@@ -64,6 +65,9 @@ LEFT, NOISE = 0.01, 1.5
 CAMERA, VALUES = 0.005, 0.05
 
 PEER = "prb_projective"
+
+#: What raises a ValueError if the packages are missing that an experiment needs besides those of Rimlight.
+NEEDS = {"fig10": lambda: classifier.network(), "caustic_shape": lambda: free_parameters.check_smoothing()}
 
 
 @dataclass(frozen=True)
@@ -121,26 +125,26 @@ def reproduce(
 ) -> list[Outcome]:
     """Run the experiments of a figure, with a report for each fit, and a summary in `out`.
 
-    figure : one of `EXPERIMENTS` or of `FIGURES`; "all" is without fig10 where its packages are missing.
+    figure : one of `EXPERIMENTS` or of `FIGURES`; "all" is without those whose packages are missing.
     peer : fit with Mitsuba's `prb_projective`, too, for as long as our fit took.
     workers : fit there, each fit on one of them. They see `out` under the same path.
 
     Raises
     ------
-    ValueError : there is no such figure, or the packages of fig10 are missing. OSError : the folder cannot be written
+    ValueError : there is no such figure, or packages that it needs are missing. OSError : the folder cannot be written
         to.
     """
     names = FIGURES.get(figure, (figure,))
     if not set(names) <= set(EXPERIMENTS):
         raise InputError(f'there is no experiment "{figure}", choose one of {", ".join([*EXPERIMENTS, *FIGURES])}')
-    if "fig10" in names:
+    for name in [name for name in NEEDS if name in names]:
         try:
-            classifier.network()
+            NEEDS[name]()
         except ValueError as error:
             if len(names) == 1:
                 raise
-            log.warning("fig10 is left out; %s", error)
-            names = [name for name in names if name != "fig10"]
+            log.warning("%s is left out; %s", name, error)
+            names = [other for other in names if other != name]
     out.mkdir(parents=True, exist_ok=True)
     jobs = [(name, seed) for name in names for seed in seeds]
     if workers is not None:

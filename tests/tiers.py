@@ -216,6 +216,10 @@ test_mirrors.py::test_gradients_are_those_of_forward_mode[over_mirror-mirror
 test_mirrors.py::test_gradients_are_those_of_forward_mode[two_mirrors
 test_mirrors.py::test_texture_coordinates_and_flipped_normals_do_not_change_mirrors
 test_mirrors.py::test_two_textures_of_one_shape
+test_passes.py::test_backward_is_forward[bdpt_edge
+test_passes.py::test_backward_is_forward[prb_edge
+test_passes.py::test_derivatives_stay_the_same
+test_passes.py::test_frozen
 test_photometric_stereo.py::test_coat_needs_evidence
 test_photometric_stereo.py::test_colours_under_a_glaze
 test_photometric_stereo.py::test_gradients_with_interreflections[depth

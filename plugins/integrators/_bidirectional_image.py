@@ -8,7 +8,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from rimlight._collection import no_collection
 from rimlight.edge_sampling.refusals import InputError, Refusal
-from rimlight.terms.sampling import in_a_row, seed_of
+from rimlight.terms.sampling import in_a_row, seed_of, seed_of_pass
 from rimlight.transport.bidirectional import CameraPaths
 from rimlight.transport.emission import Emission
 from rimlight.transport.film_views import FilmViews
@@ -49,7 +49,7 @@ def render(it, scene, sensor, seed, spp, develop, *, per_pass=None, ways=(None, 
         pixels = sampler.wavefront_size() // spp
         for i in range(spp // per_pass):
             if per_pass < spp:
-                sampler = _of_pass(sampler, seed_of("passes", seed, i), per_pass, pixels)
+                sampler = _of_pass(sampler, seed_of_pass(seed, i), per_pass, pixels)
             lights = max(1, round(pixels * per_pass * it.light_paths))
             _trace(
                 it,
@@ -58,7 +58,7 @@ def render(it, scene, sensor, seed, spp, develop, *, per_pass=None, ways=(None, 
                 scene,
                 sensor,
                 sampler,
-                in_a_row(sensor, seed_of("light paths", seed, i), lights),
+                in_a_row(sensor, seed_of("light paths", seed_of_pass(seed, i)), lights),
                 light,
                 block,
             )

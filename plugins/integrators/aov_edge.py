@@ -9,7 +9,6 @@ from itertools import accumulate
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from rimlight._collection import no_collection
 from rimlight._plan import Plan
@@ -151,7 +150,8 @@ class AOVEdgeIntegrator(EdgeIntegrator):
         # Of paths of one segment: nothing is reflected.
         super().__init__(props, max_depth=1)
         self.search = ChannelSearch(self.name, self.channels)
-        self.count = sum(len(c.components) for c in self.channels)
+        self.CHANNELS = [name for c in self.channels for name in c.components]
+        self.count = len(self.CHANNELS)
 
     def to_string(self) -> str:
         nested = "".join(f", {key}={value}" for key, value in self.nested.items())
@@ -199,20 +199,11 @@ class AOVEdgeIntegrator(EdgeIntegrator):
         for key, nested in self.nested.items():
             nested.render_backward(scene, params, self.channel(grad_in, key), sensor, seed, spp)
 
-    def _develop(self, film, terms, values):
+    def _develop(self, film, terms, values, weights=None):
         """The channels that the film makes of `values` at the positions of `terms`: (H, W, C)."""
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
             raise Refusal(f"{self.name}: a film of the class {film.class_name()} cannot hold channels, use a hdrfilm")
-        film.prepare([name for c in self.channels for name in c.components])
-        for term, value in zip(terms, values, strict=True):
-            block = film.create_block()
-            block.set_coalesce(block.coalesce() and term.per_pixel >= 4)
-            black = dr.zeros(mi.Spectrum, dr.width(term.position))
-            ADIntegrator._splat_to_block(
-                block, film, term.position, black, term.weight, mi.Float(0), list(value.values), term.wavelengths
-            )
-            film.put_block(block)
-        return film.develop()[:, :, -self.count :]
+        return super()._develop(film, terms, values, weights)[:, :, -self.count :]
 
     # ---------------------- Channels ----------------------
 

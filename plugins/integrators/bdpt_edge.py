@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -62,6 +65,9 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
     **Boundaries** are those of ``prb_edge``. What is seen on both sides of them is connected with light paths. Shadows
     in indirect light go on from where they fall, too, and edges are looked for from surfaces that light paths meet.
 
+    **Memory.** As with ``direct_edge``, many samples are taken in passes: 256 × 256 pixels, 16 samples per pixel and
+    paths of 8 segments need less than 1 GiB.
+
     **Limits.** Those of ``prb_edge``. The derivative knows only paths that bring light: with respect to a reflectance
     or a radiance that is 0, it is 0, with a warning. Missing, with a warning, are the caustics that perfect mirrors and
     glass throw in the light of emitters without size. Lamps with interpolated normals, emitters of several lights,
@@ -100,10 +106,18 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
         RuntimeError : the scene has lights or media of which paths from both ends have no derivative.
         """
         job = super().job(scene, sensor, seed, spp, mode)
-        count = max(1, round(job.pixels * max(job.counts.shading, job.counts.film) * self.light_paths))
         job.tracer.around = self._around
-        job.tracer.light_sampler = in_a_row(job.sensor, seed_of("light paths", seed, 1), count)
         return job
+
+    def passes(self, job: Job) -> list[Job]:
+        """As those of `EdgeIntegrator`, each with light paths of its own."""
+        return [replace(part, tracer=self._with_light_paths(part)) for part in super().passes(job)]
+
+    def _with_light_paths(self, job: Job) -> BidirectionalTracer:
+        count = max(1, round(job.pixels * max(job.counts.shading, job.counts.film) * self.light_paths))
+        tracer = copy(job.tracer)
+        tracer.light_sampler = in_a_row(job.sensor, seed_of("light paths", job.seed, 1), count)
+        return tracer
 
     def _boundaries(self, scene, sensor, sppi, find=None):
         self.limits.refuse(scene, self.name)

@@ -42,6 +42,9 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     light that moves takes its samples along (as in path-space differentiation, Zhang et al. 2020). So it needs no
     boundary unless something occludes it, or it touches what it lights.
 
+    **Memory.** A derivative has at most 2¹⁸ samples of a term in memory (2²¹ on a GPU), but at least one per pixel.
+    More are taken in passes. In Python, ``integrator.at_once`` is that number.
+
     **Limits.** Only triangle meshes and their instances, spheres, disks and cylinders can move: moving hair is refused,
     and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and
     cylinders cut through such shapes, cuts of the far clipping plane through any, and shadows of hair, ... on

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
+from functools import reduce
+from itertools import product
 from typing import Any
 
 import drjit as dr
@@ -17,7 +20,7 @@ from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.geometry.instances import copied_places
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.order import TERMS
-from rimlight.terms.sampling import Counts
+from rimlight.terms.sampling import AT_ONCE, Counts, over_film
 from rimlight.terms.term import FilmSamples, Job, Sample, Term, forward
 from rimlight.transport.paths import Depths
 from rimlight.transport.tracer import PathTracer
@@ -63,6 +66,9 @@ class EdgeIntegrator(ADIntegrator):
     #: Can samples be divided among its terms, see `balance`?
     BALANCES = True
 
+    #: Names of the channels that the film holds besides light.
+    CHANNELS: Sequence[str] = ()
+
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
         if "sample" in vars(cls):
@@ -84,6 +90,8 @@ class EdgeIntegrator(ADIntegrator):
         self.search = BoundarySearch(self.name, self.depths, **options)
         #: By what the samples of a term are multiplied, by its name; empty: all have as many. See `balance`.
         self.shares: dict[str, float] = {}
+        #: Most samples of a term that a derivative has in memory at once. See `passes`.
+        self.at_once: int = AT_ONCE[dr.backend_v(mi.Float)]
         self._warned: set[str] = set()
 
     def _sample_count(self, props: mi.Properties, key: str) -> int | None:
@@ -115,13 +123,15 @@ class EdgeIntegrator(ADIntegrator):
         with dr.suspend_grad(), copied_places(scene, dr.ADMode.Forward):
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Forward)
             job.boundaries.refit()
-            terms, values = [], []
-            for make in (make for term, own in job.each for make in term.samples(own)):
+            passes, images = self.passes(job), []
+            weights = self._weights(passes) if len(passes) > 1 else None
+            for part in passes:
                 # One term after the other: path replay needs that nothing else is attached to the parameters.
-                term, value = forward(make)
-                terms.append(term)
-                values.append(value)
-            image = self._develop(job.sensor.film(), terms, values)
+                made = [forward(make) for term, own in part.each for make in term.samples(own)]
+                images.append(self._develop(part.sensor.film(), *zip(*made, strict=True), weights))
+                del made
+                dr.eval(images)
+            image = reduce(operator.add, images)
         report_image(self.name, image)
         return image
 
@@ -133,57 +143,88 @@ class EdgeIntegrator(ADIntegrator):
         with dr.isolate_grad(), dr.suspend_grad(), copied_places(scene, dr.ADMode.Backward):
             job = self.job(scene, sensor, seed, spp, dr.ADMode.Backward)
             job.boundaries.refit()
-            terms = [make() for term, own in job.each for make in term.samples(own)]
-            with dr.resume_grad():
-                # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
-                # is traced for it.
-                values = [t.value.zeros(dr.width(t.position)) for t in terms]
-                dr.enable_grad(values)
-                image = self._develop(job.sensor.film(), terms, values)
-                dr.set_grad(image, grad_in)
-                dr.enqueue(dr.ADMode.Backward, image)
-                dr.traverse(dr.ADMode.Backward)
-                # The interior by itself, and first: traversed together with the film boundary, or after it, Dr.Jit 1.5
-                # loses what it gives to one mesh where another one has interpolated normals.
-                # Those that are cut are not traversed with others: at what lies behind these, Dr.Jit evaluates all, but
-                # the gradients at the cuts, which would then trace all rays again.
-                pairs = list(zip(terms, values, strict=True))
-                alone = [[pair] for i, pair in enumerate(pairs) if i == 0 or pair[0].replay is not None]
-                others = [pair for i, pair in enumerate(pairs) if i > 0 and pair[0].replay is None]
-                cut, whole = ([pair for pair in others if bool(pair[0].cuts) == is_cut] for is_cut in (True, False))
-                for group in (*alone, cut, whole):
-                    for term, value in group:
-                        gradient = dr.grad(value)
-                        if term.replay is not None:
-                            with dr.suspend_grad():
-                                start = term.replay.backward(gradient.L * term.throughput)
-                            dr.set_grad(term.replay.start, start)
-                            dr.enqueue(dr.ADMode.Backward, term.replay.start)
-                        dr.set_grad(term.value, gradient)
-                        dr.enqueue(dr.ADMode.Backward, term.value)
-                    dr.traverse(dr.ADMode.Backward)
-                    cuts = [cut for term, _ in group for cut in term.cuts]
-                    for cut in cuts:
-                        cut.schedule()
-                    dr.eval()
-                    for cut in cuts:
-                        cut.backward()
-            dr.eval()
+            passes = self.passes(job)
+            weights = self._weights(passes) if len(passes) > 1 else None
+            for part in passes:
+                self._backward(part, grad_in, weights)
         report_gradients(self.name, params)
 
-    @staticmethod
-    def _develop(film: mi.Film, terms: list[FilmSamples], values: list[Sample]) -> mi.TensorXf:
-        """The image that the film makes of `values` at the positions of `terms`: (H, W, C)."""
-        film.prepare([])
+    def _backward(self, job: Job, grad_in: mi.TensorXf, weights: mi.ImageBlock | None) -> None:
+        """`render_backward` with the samples of one pass. weights : see `_develop`."""
+        terms = [make() for term, own in job.each for make in term.samples(own)]
+        with dr.resume_grad():
+            # The image is linear in the samples: differentiate the way from them to it by itself, so that no ray
+            # is traced for it.
+            values = [t.value.zeros(dr.width(t.position)) for t in terms]
+            dr.enable_grad(values)
+            image = self._develop(job.sensor.film(), terms, values, weights)
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            # The interior by itself, and first: traversed together with the film boundary, or after it, Dr.Jit 1.5
+            # loses what it gives to one mesh where another one has interpolated normals.
+            # Those that are cut are not traversed with others: at what lies behind these, Dr.Jit evaluates all, but
+            # the gradients at the cuts, which would then trace all rays again.
+            pairs = list(zip(terms, values, strict=True))
+            alone = [[pair] for i, pair in enumerate(pairs) if i == 0 or pair[0].replay is not None]
+            others = [pair for i, pair in enumerate(pairs) if i > 0 and pair[0].replay is None]
+            cut, whole = ([pair for pair in others if bool(pair[0].cuts) == is_cut] for is_cut in (True, False))
+            for group in (*alone, cut, whole):
+                for term, value in group:
+                    gradient = dr.grad(value)
+                    if term.replay is not None:
+                        with dr.suspend_grad():
+                            start = term.replay.backward(gradient.L * term.throughput)
+                        dr.set_grad(term.replay.start, start)
+                        dr.enqueue(dr.ADMode.Backward, term.replay.start)
+                    dr.set_grad(term.value, gradient)
+                    dr.enqueue(dr.ADMode.Backward, term.value)
+                dr.traverse(dr.ADMode.Backward)
+                cuts = [cut for term, _ in group for cut in term.cuts]
+                # In the kernels of what they come from.
+                dr.eval([cut.gradients for cut in cuts])
+                for cut in cuts:
+                    cut.backward()
+        dr.eval()
+
+    def _develop(
+        self,
+        film: mi.Film,
+        terms: Sequence[FilmSamples],
+        values: Sequence[Sample],
+        weights: mi.ImageBlock | None = None,
+    ) -> mi.TensorXf:
+        """The image that the film makes of `values` at the positions of `terms`: (H, W, C).
+
+        weights : what the film divides by; None: the weights of `terms`.
+        """
+        film.prepare(list(self.CHANNELS))
+        if weights is not None:
+            # Before what carries gradients: Mitsuba 3.9 would lose these.
+            film.put_block(weights)
         for term, value in zip(terms, values, strict=True):
             block = film.create_block()
             # Mitsuba may add up neighbours in a wavefront first, if those belong to one pixel.
             block.set_coalesce(block.coalesce() and term.per_pixel >= 4)
-            ADIntegrator._splat_to_block(
-                block, film, term.position, value.L, term.weight, value.alpha, [], term.wavelengths
-            )
+            weight = term.weight if weights is None else 0.0
+            shown = value.L, weight, value.alpha, list(value.channels)
+            ADIntegrator._splat_to_block(block, film, term.position, *shown, term.wavelengths)
             film.put_block(block)
         return film.develop()
+
+    def _weights(self, passes: Sequence[Job]) -> mi.ImageBlock:
+        """The weights that the film gives to the interior samples of all passes."""
+        film = passes[0].sensor.film()
+        film.prepare(list(self.CHANNELS))
+        block = film.create_block()
+        black = mi.Spectrum(0), 1.0, mi.Float(0), [mi.Float(0)] * len(self.CHANNELS)
+        for part in passes:
+            _, own = part.each[0]
+            sampler, _ = over_film(own.sensor, own.seed, own.counts.weights)
+            ray, _, u = own.sample_rays(sampler)
+            ADIntegrator._splat_to_block(block, film, dr.detach(u), *black, ray.wavelengths)
+            dr.eval(block.tensor())
+        return block
 
     def sample(self, mode, scene, sampler, ray, active=True, **_):
         """Radiance along camera rays, as Mitsuba asks for it.
@@ -228,6 +269,11 @@ class EdgeIntegrator(ADIntegrator):
         tracer.glass, tracer.lights, tracer.lamps = boundaries.glass, boundaries.lights, boundaries.lamps
         tracer.fine_mirrors = boundaries.fine_mirrors
         return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.TERMS, self.shares)
+
+    def passes(self, job: Job) -> list[Job]:
+        """A derivative in parts, one after the other, of which each has at most `at_once` samples of a term in memory:
+        itself, if it has no more. No part has less than one sample per pixel."""
+        return job.divided(self.at_once)
 
     @no_collection()
     def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:
@@ -294,14 +340,12 @@ class EdgeIntegrator(ADIntegrator):
     def _images_of_terms(self, job: Job) -> dict[str, np.ndarray]:
         """The derivative that each term makes of the image."""
         job.boundaries.refit()
-        images, weighing = {}, []
-        for term in self.TERMS:
-            made = weighing + [forward(make) for make in term.samples(job)]
-            if not weighing:
-                # By the weights of the interior's samples the film divides all.
-                (samples, value) = made[0]
-                weighing = [(samples, value.zeros(dr.width(samples.position)))]
-            images[term.name] = np.array(self._develop(job.sensor.film(), *zip(*made, strict=True)), np.float64)
+        passes = self.passes(job)
+        weights, images = self._weights(passes), {term.name: 0.0 for term in self.TERMS}
+        for term, part in product(self.TERMS, passes):
+            made = [forward(make) for make in term.samples(part)]
+            samples, values = zip(*made, strict=True) if made else ((), ())
+            images[term.name] += np.array(self._develop(job.sensor.film(), samples, values, weights), np.float64)
         return images
 
     @no_collection()

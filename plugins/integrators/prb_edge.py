@@ -59,6 +59,8 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows, hard
     ones too, are found from the lights, on what the camera sees, and on what lights that.
 
+    **Memory.** As with ``direct_edge``, many samples are taken in passes.
+
     **Limits.** Those of ``direct_edge``, but for interreflections. Missing, with a warning, are outlines in the light
     that perfect mirrors and glass throw on other surfaces, and part of what is seen through masks. With
     ``max_depth`` above 32 or -1, the vertices of paths are counted before they are written down, which

@@ -23,6 +23,19 @@ class ChannelSample:
 
     values: list
 
+    @property
+    def channels(self) -> list:
+        """Numbers of the film besides light, which is black."""
+        return list(self.values)
+
+    @property
+    def L(self) -> mi.Spectrum:
+        return dr.zeros(mi.Spectrum, dr.width(self.values))
+
+    @property
+    def alpha(self) -> mi.Float:
+        return mi.Float(0)
+
     def zeros(self, width: int) -> ChannelSample:
         return ChannelSample([dr.zeros(mi.Float, width) for _ in self.values])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.refusals import Refusal
@@ -14,15 +15,23 @@ SALT = {"film boundary": 0xFFFFFFFF, "shadows from lights": 0xAAAAAAAA, "edges f
 SALT |= {"planes of faces": 0x33333333, "shadows in indirect light": 0x99999999}
 SALT |= {"mirrors and textures": 0x66666666}
 SALT |= {"shadows in light from surfaces": 0x88888888, "shadows in indirect light, continued": 0x77777777}
-SALT |= {"light paths": 0xCCCCCCCC, "passes": 0x0}
+SALT |= {"light paths": 0xCCCCCCCC}
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
 LINE = 16
+
+#: Most samples of a term of a derivative in memory at once, by where they are. See `Job.divided`.
+AT_ONCE = {dr.JitBackend.LLVM: 2**18, dr.JitBackend.CUDA: 2**21}
 
 
 def seed_of(term: str, seed: int | mi.UInt32, part: int = 0) -> int | mi.UInt32:
     """Seed of a term, on one part of the film, in a call with this seed."""
     return SALT[term] ^ (seed ^ part << 16)
+
+
+def seed_of_pass(seed: int | mi.UInt32, i: int) -> int | mi.UInt32:
+    """Seed of the i-th of several passes; the first one has the seed of the call."""
+    return seed if i == 0 else mi.sample_tea_32(seed, i)[0]
 
 
 @dataclass(frozen=True)
@@ -55,6 +64,11 @@ class Counts:
             film=times(self.film, term),
             shading=times(self.shading, term),
         )
+
+    def part(self, number: int) -> Counts:
+        """Those of one of so many passes, at least one where there are any."""
+        each = (-(-count // number) for count in (self.interior, self.film, self.shading))
+        return Counts(*each, self.sppp_given)
 
     def on_line(self, film: mi.Film) -> int:
         """Samples of the film boundary in all. A line covers few pixels: unless a number of samples was asked for, so

@@ -18,7 +18,7 @@ from rimlight.transport.cut import Cut
 from rimlight.transport.replay import ChosenVertex, Replay
 from rimlight.transport.tracer import PathTracer
 
-from .sampling import Counts, per_pixel, size
+from .sampling import Counts, per_pixel, seed_of_pass, size
 
 #: Name of the term whose samples are those of the image.
 INTERIOR = "interior"
@@ -33,6 +33,9 @@ class Sample:
 
     L: mi.Spectrum
     alpha: mi.Float
+
+    #: Numbers of the film besides light.
+    channels = ()
 
     def zeros(self, width: int) -> Sample:
         return dr.zeros(Sample, width)
@@ -105,6 +108,21 @@ class Job:
         shares = [[self.shares.get(name, 1.0) for name in (INTERIOR, term.name)] for term in self.terms]
         counts = [self.counts.shared(*share) for share in shares]
         return [(term, replace(self, counts=own)) for term, own in zip(self.terms, counts, strict=True)]
+
+    def divided(self, at_once: int) -> list[Job]:
+        """The same in passes of equal size, with other random numbers each. Of no term, one of them has more than
+        `at_once` samples, if one sample per pixel is not more."""
+        counts = [own.counts for _, own in self.each]
+        samples = [max(c.interior, c.shading) * self.pixels for c in counts]
+        samples += [c.on_line(part.sensor.film()) for c in counts for part in self.parts]
+        spp = max(self.counts.interior, self.counts.film, self.counts.shading, 1)
+        needed = min(max(-(-max(samples) // at_once), 1), spp)
+        # Else some more samples are made, so that all passes have as many.
+        number = next((n for n in range(needed, min(2 * needed, spp + 1)) if spp % n == 0), needed)
+        if number == 1:
+            return [self]
+        of_each = self.counts.part(number)
+        return [replace(self, counts=of_each, seed=seed_of_pass(self.seed, i)) for i in range(number)]
 
     @cached_property
     def parts(self) -> list[FilmPart]:

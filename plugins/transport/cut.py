@@ -50,13 +50,14 @@ class Cut:
             for (_, cut), derivative in zip(self._cuts, derivatives, strict=True):
                 dr.set_grad(cut, dr.detach(derivative))
 
-    def schedule(self) -> None:
-        """Let the next evaluation find the gradients, in the kernel of what they come from."""
-        dr.schedule([dr.grad(cut) for _, cut in self._cuts])
+    @property
+    def gradients(self) -> list:
+        """What `backward` passes on, of each array."""
+        return [dr.grad(cut) for _, cut in self._cuts]
 
     def backward(self) -> None:
         """Pass the gradients on."""
-        gradients = [dr.grad(cut) for _, cut in self._cuts]
+        gradients = self.gradients
         dr.eval(gradients)
         for (array, _), gradient in zip(self._cuts, gradients, strict=True):
             dr.accum_grad(array, gradient)  # it may be a parameter, which has a gradient from elsewhere

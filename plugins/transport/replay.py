@@ -317,14 +317,15 @@ class MovingVertex:
         )
         return p, n, d
 
-    def schedule(self) -> None:
-        """Let the next evaluation find the gradients, in the kernel of what they come from."""
-        dr.schedule(*(dr.grad(leaf) for leaf in self.leaves))
+    @property
+    def gradients(self) -> list:
+        """What `backward` hands on."""
+        return [dr.grad(leaf) for leaf in self.leaves]
 
     def backward(self) -> None:
         """Hand the gradients on to the surfaces, and to the camera rays."""
         chain, log = self.chain, self.log
-        δp, δn, δd, δaxis = (dr.grad(leaf) for leaf in self.leaves)
+        δp, δn, δd, δaxis = self.gradients
         dr.eval(δp, δn, δd, δaxis)
 
         def bounce(depth, δp, δn, δd):

@@ -30,7 +30,7 @@ LEFT = {
 }
 
 #: Fits in light that is hard to find from the camera, and steps of a small one.
-HIDDEN_LIGHT = {"lampshade": 12, "caustic": 40}
+HIDDEN_LIGHT = {"lampshade": 12, "caustic": 40, "caustic_shape": 40}
 
 
 @pytest.mark.usefixtures("no_derivative_image")

@@ -14,8 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-#: What comes before the samples, the search for boundaries; and what comes after them, the check of the result.
-BESIDES = {"job", "refit", "zeros", "report_gradients"}
+#: What comes before the samples, the search for boundaries and the division into passes; and what comes after them, the
+#: check of the result.
+BESIDES = {"job", "passes", "refit", "zeros", "report_gradients"}
 
 
 class Way:

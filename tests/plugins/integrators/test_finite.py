@@ -25,7 +25,7 @@ def moving():
 def spoil(integrator, monkeypatch, spoiled):
     """Give the film samples of the derivative to `spoiled` before they are developed."""
     develop = type(integrator)._develop
-    wrong = lambda film, terms, values: develop(film, terms, [spoiled(v) for v in values])
+    wrong = lambda film, terms, values, *rest: develop(integrator, film, terms, [spoiled(v) for v in values], *rest)
     monkeypatch.setattr(integrator, "_develop", wrong, raising=False)
 
 
