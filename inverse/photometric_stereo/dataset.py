@@ -17,6 +17,7 @@ from tqdm import tqdm
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.leds import Led, read_leds, write_leds
 
+from . import compression
 from .encoding import ENCODED, JUDGED, looks_encoded
 from .files import (
     CAMERA,
@@ -70,6 +71,8 @@ class Dataset:
     #: Mean (geometric) of the depth of the object, or of each of its parts, along the axis of the camera, in the unit
     #: of the LEDs: normals leave the scale of depth open, and near lights do not. Needed with these only.
     distance: float | None = None
+    #: What its files tell of faults, in sentences.
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self):
         P, K, channels = self.values.shape
@@ -224,7 +227,7 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     and `Normal_gt.mat` or `Normal_gt.exr`.
 
     Pictures are EXR, PNG or TIFF, which are taken to be linear as DiLiGenT's are, or JPEG, which is decoded from sRGB.
-    Those that are black in the mask are left out, and logged.
+    Those that are black in the mask are left out, and logged. So are doubts about them, which the data set keeps.
 
     images : read only so many, evenly from their list. 0: all.
 
@@ -244,12 +247,15 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
         black = ", ".join(name for k, name in enumerate(names) if k not in lit)
         log.warning("ps: black in the mask, and left out: %s; were these lamps on?", black)
         setup, values = setup.chosen(lit), values[:, : len(lit)]
+    doubts = compression.judged(folder, setup.names, mask).said()
     few = every(values, JUDGED)
     if not setup.near and looks_encoded(
         few * setup.intensities.astype(np.float32), setup.names, setup.lights, setup.intensities
     ):
-        log.warning(ENCODED)
-    return setup.dataset(values, mask, read_truth(folder, mask))
+        doubts.append(ENCODED)
+    for text in doubts:
+        log.warning("ps: %s", text)
+    return replace(setup.dataset(values, mask, read_truth(folder, mask)), doubts=tuple(doubts))
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ JUDGED = 2000
 
 #: Said of pictures that look so.
 ENCODED = (
-    "ps: the pictures have 8 bits, and look as if they were encoded as sRGB, but PNG and TIFF are taken to be linear; "
-    "export them with 16 bits, linear, or as JPEG, which is decoded"
+    "The pictures have 8 bits, and look as if they were encoded as sRGB, but PNG and TIFF are taken to be linear; "
+    "export them with 16 bits, linear, or as JPEG, which is decoded."
 )
 
 

@@ -14,7 +14,8 @@ from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.inverse.page import shrunk
 
-from . import cost, dataset, encoding, evidence, files, least_squares, plausibility, start
+from . import compression, cost, dataset, encoding, evidence, files, least_squares, plausibility, start
+from .compression import Compression
 from .dataset import Dataset
 from .plausibility import Plausibility
 from .reconstruction import Options
@@ -43,6 +44,7 @@ class Inspection:
     bits : for each channel, in words. saturated, black, shadowed : part of each image's pixels of the mask, (K,); the
     last is an estimate. exposures : (K,), estimated. directions : (K, 3), of the lights, from the object.
     small : the images, shrunk, linear. mean : of all images, (H, W, 3), linear, with the mask beside it.
+    compression : how far JPEG has changed values.
     misfits : of a diffuse surface to the images, as they are, and decoded from sRGB; None where this says nothing.
     plausibility : are the data what their files say?
     """
@@ -60,6 +62,7 @@ class Inspection:
     directions: np.ndarray
     small: list[np.ndarray]
     mean: np.ndarray
+    compression: Compression
     misfits: tuple[float, float] | None
     plausibility: Plausibility
     options: Options
@@ -147,6 +150,7 @@ def inspect(folder: Path, options: Options | None = None) -> Inspection:
         directions=directions,
         small=small,
         mean=mean,
+        compression=compression.judged(folder, names, mask),
         misfits=_misfits(raw, setup),
         plausibility=_plausibility(blocks, coarse, replace(setup, camera=dataset.coarser(setup.camera, step))),
         options=options,
@@ -178,7 +182,7 @@ def warnings(found: Inspection) -> list[str]:
             f"A reconstruction would take {found.memory / 2**30:.1f} GiB of memory, of which {there / 2**30:.1f} GiB "
             "are available, and will be refused: use fewer --images, or --resolutions 0.25 0.5 with --iterations 10 6."
         )
-    said += found.plausibility.said()
+    said += found.compression.said() + found.plausibility.said()
     if found.plausibility.order.known and found.misfits is not None and found.misfits[1] < found.misfits[0]:
         said.append(
             "The pictures look like exports for the screen (sRGB), and PNG and TIFF are taken to be linear: decoded, "
@@ -220,6 +224,8 @@ def table(found: Inspection) -> list[tuple[str, str]]:
         ("black", span(found.black)),
         ("in shadow, estimated", span(found.shadowed)),
     ]
+    if found.compression.quality > 0:
+        rows.append(("compression", str(found.compression)))
     if found.misfits is not None:
         linear, decoded = (f"{100 * x:.1f} %" for x in found.misfits)
         rows.append(("off a diffuse surface", f"{linear} as linear, {decoded} decoded from sRGB"))

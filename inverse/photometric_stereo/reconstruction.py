@@ -218,7 +218,7 @@ class Reconstruction:
         if not mi.is_rgb or mi.is_polarized:
             raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
-        self.doubts = plausibility.check(data)
+        self.doubts = data.doubts + plausibility.check(data)
         self.data, self.options, self.after = data, options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
