@@ -103,6 +103,8 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     if len(lit) < FEWEST:
         return Order(names)
     C, rng = _products(values[:, lit]), np.random.default_rng(0)
+    if C is None:
+        return Order(names)
     *_, third, second, first = np.linalg.eigvalsh(C)
     if second + third < TOLD * (1 - first):
         return Order(names)
@@ -130,12 +132,13 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     )
 
 
-def _products(values: np.ndarray) -> np.ndarray:
-    """Mean products of the images, (K, K), of trace 1. All pixels count alike, and highlights little."""
+def _products(values: np.ndarray) -> np.ndarray | None:
+    """Mean products of the images, (K, K), of trace 1; None if all pixels are black in most images. All pixels count
+    alike, and highlights little."""
     v = values / np.maximum(values.mean(1, keepdims=True), 1e-12 * max(values.max(), 1e-30))
     v = np.minimum(v, np.quantile(v, CAPPED, axis=1, keepdims=True))
     C = v.T.astype(np.float64) @ v
-    return C / np.trace(C)
+    return C / np.trace(C) if C.any() else None
 
 
 def _projector(lights: np.ndarray) -> np.ndarray:
