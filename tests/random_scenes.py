@@ -60,6 +60,7 @@ SPECIAL = {
     "parameters": "their materials have all kinds of values, and any parameters change (`random_parameters.py`)",
     "mirrors": "perfect mirrors and glass show what points, spots and suns light (`random_mirrors.py`)",
     "meshes": "things are torn, turned round, cut through themselves, or one of many faces (`random_meshes.py`)",
+    "polished": "most surfaces are polished: their highlights are narrow",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
@@ -256,8 +257,10 @@ class Generator:
         if self.special == "jumps":
             kinds = [*MIRRORS[:3], *MIRRORS[3:] * closed]
             kinds += ["black"] * 3 if self.glows else ["checkers", "texels", "bumps", "leaf"] * uv
+        if self.special == "polished":
+            kinds = ["diffuse", "roughplastic", "roughplastic", "roughconductor", "blend"]
         kind = "diffuse" if self.instances else self.pick(*kinds)
-        colour, alpha = self.colour(), self.uniform(0.1, 0.4)
+        colour, alpha = self.colour(), self.uniform(0.1, 0.4) * (0.2 if self.special == "polished" else 1)
         bsdf = {
             "diffuse": lambda: {"type": "diffuse", "reflectance": colour},
             "twosided": lambda: {"type": "twosided", "inner": {"type": "diffuse", "reflectance": colour}},

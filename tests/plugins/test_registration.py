@@ -54,14 +54,13 @@ def throwaway(tmp_path: Path) -> Iterator[None]:
     package = importlib.import_module("rimlight.integrators")
     package.__path__.append(str(tmp_path))
     importlib.invalidate_caches()
-    modules = dict(_registration._modules)
     _registration._modules.clear()
     variant = mi.variant()
     yield
     mi.set_variant(variant)
     package.__path__.remove(str(tmp_path))
+    # Afresh: Mitsuba knows the latest classes, and imports must find the modules of these.
     _registration._modules.clear()
-    _registration._modules.update(modules)
     rimlight.register()
 
 
