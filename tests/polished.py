@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
 
 
@@ -35,14 +36,20 @@ def table() -> mi.Scene:
     return floor(lacquer(0.05))
 
 
-def sky() -> mi.Scene:
+def sky(light: dict | None = None) -> mi.Scene:
     """A polished floor and a black cube under the sky."""
     return scene(
         sensor=camera((0.3, 1.2, -2.2), (0, 0, 0.2)),
         floor=horizontal((0, 0, 0), 1.5, "floor", bsdf=metal(0.05)),
         cube=cube("cube", 0.16, (-0.15, 0.45, 0.7), bsdf=diffuse(0.0)),
-        sky=constant(1.0),
+        sky=light or constant(1.0),
     )
+
+
+def environment() -> mi.Scene:
+    """The same under a sky that differs from place to place."""
+    picture = np.random.default_rng(1).uniform(0.1, 2, (8, 16, 3)).astype(np.float32)
+    return sky({"type": "envmap", "bitmap": mi.Bitmap(picture)})
 
 
 def wall() -> mi.Scene:
@@ -57,6 +64,7 @@ def wall() -> mi.Scene:
 
 
 CAMERA_ALONG = {"key": "sensor.to_world", "direction": [1, 0, 0]}
+CAMERA_TURNS = {"key": "sensor.to_world", "rotate": [0, 1, 0]}
 FLOOR_TILTS = {"key": "floor.vertex_positions", "rotate": [0.2, 0, 1]}
 LAMP_ALONG = {"key": "lamp.vertex_positions", "direction": [1, 0.3, 0]}
 WALL_TILTS = {"key": "wall.vertex_positions", "rotate": [0.3, 1, 0]}

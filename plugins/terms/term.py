@@ -111,7 +111,7 @@ class Job:
 
     def divided(self, at_once: int) -> list[Job]:
         """The same in passes of equal size, with other random numbers each. Of no term, one of them has more than
-        `at_once` samples, if one sample per pixel is not more."""
+        `at_once` samples, rounded up to whole samples per pixel."""
         counts = [own.counts for _, own in self.each]
         samples = [max(c.interior, c.shading) * self.pixels for c in counts]
         samples += [c.on_line(part.sensor.film()) for c in counts for part in self.parts]

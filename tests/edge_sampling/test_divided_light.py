@@ -106,8 +106,9 @@ def blurred() -> mi.Scene:
         (blurred, polished.FLOOR_TILTS, (0.3, 1e-3)),
         (polished.table, polished.LAMP_ALONG, (0.3, 1e-3)),
         (polished.wall, polished.CAMERA_ALONG, (0.3, 1e-3)),
+        (polished.environment, polished.CAMERA_TURNS, (0.3, 1e-3)),
     ],
-    ids=["floor", "table", "wall"],
+    ids=["floor", "table", "wall", "environment"],
 )
 def test_any_width_gives_the_same_derivative(make, motion, widths, monkeypatch):
     assert_same_derivative(make, motion, monkeypatch, "rimlight.edge_sampling.divided_light.NARROW", widths, runs=16)
