@@ -247,6 +247,7 @@ def _choose() -> LLVM | None:
         if os.environ.get(VARIABLE) != DISABLED:
             warnings.warn(f"{error}\nOnly the {backend} backend can be used.", RuntimeWarning, stacklevel=2)
             os.environ[VARIABLE] = DISABLED
+        _wait_for_drjit()
         return None
     os.environ[VARIABLE] = llvm.path
     return llvm
@@ -256,7 +257,8 @@ def _adopt() -> LLVM | None:
     """As `_choose`, for a Dr.Jit that was imported earlier and has made its own choice."""
     import drjit as dr
 
-    usable = dr.has_backend(dr.JitBackend.LLVM)  # waits until Dr.Jit, which starts in a thread of its own, is ready
+    _wait_for_drjit()
+    usable = dr.has_backend(dr.JitBackend.LLVM)
     found = dr.detail.llvm_version()
     if usable and found[0] >= MIN_MAJOR:
         named = os.environ.get(VARIABLE, "")
@@ -272,6 +274,18 @@ def _adopt() -> LLVM | None:
         raise RuntimeError(message)
     warnings.warn(f"{message}\nOnly the {backend} backend can be used.", RuntimeWarning, stacklevel=2)
     return None
+
+
+def _wait_for_drjit() -> None:
+    """Wait until Dr.Jit, which starts in a thread of its own, is ready, without holding Python's global lock.
+
+    Whatever is asked of Dr.Jit waits for that thread, but most functions hold the lock meanwhile. The thread needs it
+    to print that an LLVM is missing or too old, so both would wait forever where the message comes late (a library on
+    a cold disk; Dr.Jit's issue 524). `drjit.sync_thread` gives the lock away.
+    """
+    import drjit as dr
+
+    dr.sync_thread()
 
 
 def _setting() -> str:

@@ -246,6 +246,36 @@ def test_rimlight_imported_after_drjit_found_nothing() -> None:
     assert "Import `rimlight` before `mitsuba`" in process.stderr
 
 
+SLOW_DISK = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <string.h>
+#include <unistd.h>
+void *dlopen(const char *file, int mode) {
+    void *(*original)(const char *, int) = dlsym(RTLD_NEXT, "dlopen");
+    void *library = original(file, mode);
+    if (file && strstr(file, "LLVM"))
+        usleep(500000);  // more than Rimlight needs to ask
+    return library;
+}
+"""
+
+
+@needs_good
+@pytest.mark.skipif(sys.platform != "linux" or not shutil.which("cc"), reason="needs Linux and a C compiler")
+@pytest.mark.skipif(_llvm.other_backend() is not None, reason="another backend takes over")
+def test_rimlight_imported_while_drjit_still_starts(tmp_path: Path) -> None:
+    """Dr.Jit complains about its library only when Rimlight waits for it already."""
+    preloaded = tmp_path / "slow_disk.so"
+    (tmp_path / "slow_disk.c").write_text(SLOW_DISK)
+    subprocess.run(
+        ["cc", "-shared", "-fPIC", "-o", preloaded, tmp_path / "slow_disk.c", "-ldl"], check=True, timeout=60
+    )
+    code = "import drjit\nimport rimlight"
+    process = run(code, **{_llvm.VARIABLE: "/nowhere/libLLVM.so", "LD_PRELOAD": str(preloaded)})
+    assert_explains(process)
+
+
 @needs_good
 def test_rimlight_imported_while_a_good_library_is_in_use() -> None:
     code = "import mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\nx = mi.Float(1, 2)\nimport rimlight\nprint(x)"
