@@ -270,6 +270,28 @@ def bumpy_ball() -> mi.Scene:
     return in_the_light_of_a_point(ball)
 
 
+def rippled(kind: str, nested: dict, height: float = 0.0) -> mi.Scene:
+    """A plate with a gentle map of normals or heights: a mirror below a cube, or the surface of water above it."""
+    bsdf = {**mapped(kind), "nested": nested}
+    data = np.array(mi.Bitmap(bsdf["normalmap"]["bitmap"]))
+    data[..., : 2 if kind == "normalmap" else 1] = 0.5 + 0.15 * (data[..., : 2 if kind == "normalmap" else 1] - 0.5)
+    bsdf["normalmap"]["bitmap"] = mi.Bitmap(data)
+    place = mi.ScalarTransform4f().translate([0.1, height, 0]).rotate([1, 0, 0], -90).scale(1.5)
+    plate = {"type": "rectangle", "id": "mirror", "to_world": place, "bsdf": bsdf}
+    floor = horizontal((0.1, -0.3, 0), 3, "floor", bsdf=diffuse(0.0), emitter=light(0.3, 0.4, 0.5))
+    at = camera((0.6, 2.4, -3.4), (0.1, 0.2, 0))
+    lit = cube(bsdf=diffuse(0.0), emitter=light(2, 1, 0.5))
+    return scene(sensor=at, cube=lit, mirror=plate, floor=floor, sky=constant(0.4))
+
+
+def rippled_mirror() -> mi.Scene:
+    return rippled("bumpmap", {"type": "conductor"})
+
+
+def rippled_water() -> mi.Scene:
+    return rippled("normalmap", {"type": "dielectric", "int_ior": 1.33}, height=1.25)
+
+
 SLIDE = {"key": "cube.vertex_positions", "direction": [1, 0.3, 0.4]}
 TURN = {"key": "cube.vertex_positions", "rotate": [0.3, 1, 0.2]}
 MIRROR = {"key": "mirror.vertex_positions", "rotate": [0.6, 0.2, 1]}
@@ -314,4 +336,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "bumpy_ball": (bumpy_ball, BALL, 2e-3, 2),
     "aligned_ball": (aligned_ball, MESH, 2e-3, 2),
     "mirrored_lamp": (mirrored_lamp, CAMERA, 2e-3, 2),
+    "rippled_mirror": (rippled_mirror, SLIDE, 2e-3, 3),
+    "rippled_mirror_turns": (rippled_mirror, {"key": "mirror.to_world", "rotate": [0.6, 0.2, 1]}, 2e-3, 3),
+    "rippled_water": (rippled_water, SLIDE, 2e-3, 3),
 }

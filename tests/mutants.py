@@ -220,6 +220,12 @@ MUTANTS = [
         "pass",
     ),
     mutant(
+        "mirrors and textures: the ray beyond a mapped mirror moves as if nothing mapped its normals",
+        "plugins/transport/film_chains.py",
+        "        if self._mapped:",
+        "        if False:",
+    ),
+    mutant(
         "mirrors and textures: lamps are dark just inside of their outline",
         "plugins/transport/tracer.py",
         "turn_to_viewer(si, vertex.ray, active & beside_outline)",

@@ -25,8 +25,9 @@ from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
 from rimlight.edge_sampling.rays import lift
 from rimlight.transport.cut import Cut
-from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment, change_of
+from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment
 from rimlight.transport.paths import Vertex
+from rimlight.transport.ray_derivatives import change_of
 from rimlight.transport.replay import Chain, MovingVertex, written
 
 from .sampling import in_a_row, seed_of

@@ -7,20 +7,19 @@ segment is bisected (`terms/mirrors.py`). Here chains are followed, and two of t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.found import Boundaries
-from rimlight.edge_sampling.geometry.instances import surface_met
-from rimlight.edge_sampling.geometry.meshes import surfaces
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, surfaces
 from rimlight.edge_sampling.geometry.surfaces import components
 from rimlight.edge_sampling.rays import spawn_ray, starts_in
 
 from .log import Log
 from .paths import Vertex
+from .ray_derivatives import RayDerivative, change_of, normal_derivative
 from .scattering import Next, Numbers
 from .tracer import PathTracer, camera_vertex
 
@@ -34,59 +33,6 @@ ROUNDING, BENT = 256, 1e-3
 
 #: Part of a pixel by which film positions differ of which derivatives along the film are made.
 STEP = 0.25
-
-
-@dataclass
-class RayDerivative:
-    """How a ray moves along one axis of the film, per pixel (Igehy 1999, "Tracing ray differentials")."""
-
-    o: mi.Vector3f
-    d: mi.Vector3f
-
-    def at(self, ray: mi.Ray3f, si: mi.SurfaceInteraction3f) -> mi.Vector3f:
-        """Of the point in which the ray meets a surface."""
-        across = self.o + si.t * self.d
-        return mi.Vector3f(across - ray.d * (dr.dot(si.n, across) / dr.dot(si.n, ray.d)))
-
-    def beyond(self, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, d: mi.Vector3f, η: mi.Float) -> RayDerivative:
-        """Of the ray that a mirror, or glass of the relative index η, makes of it, whose direction is d.
-
-        Both have d = r·d₀ + γ·n with a number r; γ follows from the length of d.
-        """
-        p, n = self.at(ray, si), mi.Vector3f(si.sh_frame.n)
-        moved = normal_derivative(si, p)
-        r = dr.select(dr.dot(d, n) * dr.dot(ray.d, n) > 0, dr.rcp(η), 1)
-        γ = dr.dot(d - r * ray.d, n)
-        rest = r * self.d + γ * moved
-        return RayDerivative(p, rest - n * (dr.dot(d, rest) / dr.dot(d, n)))
-
-
-def normal_derivative(si: mi.SurfaceInteraction3f, moved: mi.Vector3f) -> mi.Vector3f:
-    """By how much the shading normal changes, where the point moves by so much."""
-    du, dv = components(moved, si.dp_du, si.dp_dv)
-    return du * si.dn_du + dv * si.dn_dv
-
-
-def change_of(
-    scene: mi.Scene,
-    function: Callable[[mi.SurfaceInteraction3f], mi.Float],
-    ray: mi.Ray3f,
-    pi: mi.PreliminaryIntersection3f,
-    way: RayDerivative,
-    active: mi.Bool,
-) -> mi.Float:
-    """Derivative of a function of the point that a ray meets, where the ray moves, but not the scene. Detached."""
-    τ = dr.zeros(mi.Float, dr.width(ray))
-    with dr.resume_grad():
-        dr.enable_grad(τ)
-    with dr.resume_grad(τ):
-        moved = mi.Ray3f(ray)
-        moved.o, moved.d = ray.o + τ * way.o, ray.d + τ * way.d
-        value = function(surface_met(scene, moved, pi, mi.RayFlags.All, active))
-        dr.set_grad(τ, 1)
-        dr.enqueue(dr.ADMode.Forward, τ)
-        dr.traverse(dr.ADMode.Forward)
-        return dr.detach(dr.grad(value))
 
 
 class FilmRays:
@@ -265,6 +211,8 @@ class Chains:
         self.tracer, self.rays, self.surfaces = tracer, rays, boundaries.surfaces
         self.mirrors, self.textures, self.shown = boundaries.mirrors, boundaries.textures, boundaries.shown
         bsdfs = [s.bsdf().flags() for s in surfaces(tracer.scene) if s.bsdf() is not None]
+        #: Mirrors and glass with normal maps or bump maps.
+        self._mapped = [mi.BSDFPtr(s.bsdf()) for s in surfaces(tracer.scene) if self.mirrors and is_mapped_mirror(s)]
         self._any_mask = self.mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
 
     def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:
@@ -308,6 +256,12 @@ class Chains:
         beyond = tuple(
             dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
         )
+        if self._mapped:
+            mapped = self._is_mapped(bsdf) & goes_on & ~through
+            beyond = tuple(
+                self._beyond_mapped(way, old, vertex, bsdf, numbers, mapped)
+                for way, old in zip(ways, beyond, strict=True)
+            )
         cells = dr.select(met, self.textures.cell(si), 0) if self.textures is not None else mi.UInt32(0)
         textured = met & self.textures.has_own(si) if self.textures is not None else mi.Bool(False)
         seen = Seen(
@@ -322,6 +276,22 @@ class Chains:
             mi.Bool(False),
         )
         return Link(seen, onwards, beyond, lobe, numbers, self._in_shadow(si, vertex.depth, choice, met))
+
+    def _is_mapped(self, bsdf: mi.BSDFPtr) -> mi.Bool:
+        found = mi.Bool(False)
+        for mapped in self._mapped:
+            found |= bsdf == mapped
+        return found
+
+    def _beyond_mapped(self, way, beyond, vertex: Vertex, bsdf, numbers: Numbers, active: mi.Bool) -> RayDerivative:
+        """Of the ray beyond a mirror, where that is active: its mapped normals change as its samples tell."""
+
+        def direction(si: mi.SurfaceInteraction3f) -> mi.Vector3f:
+            bs, _ = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, active)
+            return si.to_world(bs.wo)
+
+        d = change_of(self.tracer.scene, direction, vertex.ray, vertex.pi, way, active)
+        return RayDerivative(beyond.o, dr.select(active, d, beyond.d))
 
     def _in_shadow(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, choice: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Is a point in the shadow of a light? (Shadows on what the camera sees itself are found from the light.)"""
@@ -431,6 +401,11 @@ class Chains:
         past the strip, the film boundary (`DeviceEdges.farther`) as well as bisection, and has the whole jump.
         """
         return starts_in(self.tracer.scene, a.ray, dr.minimum(a.pi.t, b.pi.t))
+
+
+def is_mapped_mirror(shape: mi.Shape) -> bool:
+    """Is a shape a perfect mirror or smooth glass with a normal map or a bump map?"""
+    return bool(shape.bsdf() and shape.bsdf().flags() & mi.BSDFFlags.Delta and has_normal_map(shape))
 
 
 def _shape_of(pi: mi.PreliminaryIntersection3f) -> mi.UInt32:
