@@ -67,8 +67,8 @@ class State:
 
     def beats(self, start: State) -> bool:
         """Does it predict better than the start, do its normals depend less on which lights tell them, and are they
-        about as much those of a surface? Where nothing can be left out, it does."""
-        worse = self.left_out >= start.left_out or self.halves >= start.halves or self.curl > start.curl + CURLED
+        about as much those of a surface? Where nothing can be left out, nothing does."""
+        worse = not self.left_out < start.left_out or self.halves >= start.halves or self.curl > start.curl + CURLED
         return not worse
 
     def needed_beside(self, simpler: State) -> bool:

@@ -195,8 +195,8 @@ def warnings(found: Inspection) -> list[str]:
     said += _of_images(found)
     if found.images < evidence.FEWEST:
         said.append(
-            f"With fewer than {evidence.FEWEST} images, none can be left out to judge the result by: nothing protects "
-            "from a reconstruction that is worse than its start."
+            f"With fewer than {evidence.FEWEST} images, none can be left out to judge a result by: the start will be "
+            "kept, normals of a diffuse surface. Take more images."
         )
     if found.parts > 1:
         said.append(
