@@ -113,8 +113,9 @@ class Judge:
 
     @property
     def able(self) -> bool:
-        """Are there lights enough?"""
-        return bool(self.left.any())
+        """Are there lights enough, so that values are left out that count?"""
+        pixels = self.pixels()
+        return bool((self.left[pixels] & (self.counts[pixels] > 0)).any())
 
     def pixels(self) -> np.ndarray:
         """Numbers of those by which it judges, ascending."""

@@ -371,6 +371,23 @@ def test_what_is_left_out_of_few_lights() -> None:
         assert left.any() == (K > 3) == left.any(0).all()
 
 
+def test_what_is_left_out_may_not_count() -> None:
+    """Of a small flat thing, the darkest value of all pixels: then nothing is judged, and nothing divided by 0."""
+    mask, lights = np.zeros((10, 10), bool), simulation.spiral(5, 40)
+    mask[:8, :8] = True
+    values = np.random.default_rng(0).normal(1, 1e-3, (64, 5, 3)) * (lights[:, 2:] / np.pi)
+    data = Dataset(values.astype(np.float32), mask, lights, np.ones((5, 3)))
+    darkest = lights[:, 2].argmin()
+    for seed in range(40):
+        left = left_out(data, seed)
+        found = ps.reconstruct(data, ps.Options(**QUICK, seed=seed), progress=False) if left[0, darkest] else None
+        if found is not None:
+            break
+    assert found.verdict == "not judged" and angles(found.guess.normals, [0, 0, 1]).mean() < 1
+    exact = alternation.State(None, None, Kind(), left_out=0.0)
+    assert exact.better_than(exact) and not dataclasses.replace(exact, left_out=0.1).better_than(exact)
+
+
 def test_darkest_values_of_few_lights() -> None:
     values = np.random.default_rng(0).uniform(size=(20, 40))
     for K, kept in ((3, 3), (4, 4), (5, 4), (10, 8), (40, 32)):
