@@ -169,7 +169,10 @@ class Dataset:
             return self
         mask, mean = self.blocks(step)
         if not mask.any():
-            raise InputError(f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left; leave out this one of the resolutions")
+            raise InputError(
+                f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left; leave this size out of the "
+                "resolutions"
+            )
         camera = coarser(self.camera, step)
         truth = None if self.truth is None else unit(mean(self.truth))
         return replace(self, values=mean(self.values).astype(np.float32), mask=mask, camera=camera, truth=truth)
