@@ -125,7 +125,8 @@ def read_picture(source: Any) -> tuple[np.ndarray, bool]:
         # scikit-image reads colours of 16 bits as 8.
         image = np.asarray(mi.Bitmap(str(path)) if path.suffix.lower() == ".png" else io.imread(path))
     except (OSError, ValueError, SyntaxError, RuntimeError) as error:
-        raise OSError(f'fit: cannot read "{path}": {one_line(error)}') from None
+        remedy = "; save it without compression" * ("imagecodecs" in str(error))
+        raise OSError(f'fit: cannot read "{path}": {one_line(error)}{remedy}') from None
     if not np.issubdtype(image.dtype, np.unsignedinteger) and not np.issubdtype(image.dtype, np.floating):
         raise InputError(f'fit: "{path.name}" is no picture of 8 or 16 bits a channel, or of floating point numbers')
     if path.suffix.lower() in (".jpg", ".jpeg") and image.ndim == 3 and image.shape[2] == 4:

@@ -41,6 +41,9 @@ GAIN = 0.25
 #: details that the start lacks are less smooth. Set with the random sets of the seeds 1000 to 1023.
 CURLED = 1.0
 
+#: Smaller deviations of predictions are those of rounding, and may be 0.
+NOTHING = 1e-9
+
 #: Alternations end after so many that predict what was left out worse than the best one did.
 PATIENCE = 3
 
@@ -67,8 +70,8 @@ class State:
 
     def beats(self, start: State) -> bool:
         """Does it predict better than the start, do its normals depend less on which lights tell them, and are they
-        about as much those of a surface? Where nothing can be left out, it does."""
-        worse = self.left_out >= start.left_out or self.halves >= start.halves or self.curl > start.curl + CURLED
+        about as much those of a surface? Where nothing can be left out, nothing does."""
+        worse = not self.left_out < start.left_out or self.halves >= start.halves or self.curl > start.curl + CURLED
         return not worse
 
     def needed_beside(self, simpler: State) -> bool:
@@ -80,7 +83,7 @@ class State:
         """The product of `left_out` and `halves` over that of the other one; of `left_out` alone if halves are not
         known."""
         known = np.isfinite([self.halves, other.halves]).all() and other.halves > 0
-        return self.left_out / other.left_out * (self.halves / other.halves if known else 1)
+        return self.left_out / max(other.left_out, NOTHING) * (self.halves / other.halves if known else 1)
 
 
 @dataclass

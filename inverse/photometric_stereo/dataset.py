@@ -17,7 +17,7 @@ from tqdm import tqdm
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.leds import Led, read_leds, write_leds
 
-from . import compression
+from . import compression, files
 from .encoding import ENCODED, JUDGED, looks_encoded
 from .files import (
     CAMERA,
@@ -38,6 +38,9 @@ from .integration import check_camera, ray_matrix
 from .vectors import LUMINANCE, every, unit
 
 log = logging.getLogger(__name__)
+
+#: Said of sets that show nothing.
+ALL_BLACK = "ps: all images are black in the mask; check the images, their exposure and the mask"
 
 #: Part of the values that may be as large as the largest one, by chance.
 CLIPPED = 1e-3
@@ -166,7 +169,10 @@ class Dataset:
             return self
         mask, mean = self.blocks(step)
         if not mask.any():
-            raise InputError(f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left")
+            raise InputError(
+                f"ps: the mask is too small: at a size of {size:g}, no pixel of it is left; leave this size out of the "
+                "resolutions"
+            )
         camera = coarser(self.camera, step)
         truth = None if self.truth is None else unit(mean(self.truth))
         return replace(self, values=mean(self.values).astype(np.float32), mask=mask, camera=camera, truth=truth)
@@ -243,11 +249,13 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
         values[:, len(lit)] = read_pixels(folder / name, mask) / intensities[k]
         if not (values[:, len(lit)] <= 0).all():
             lit.append(k)
+    if len(values) and not lit:
+        raise InputError(ALL_BLACK)
     if 0 < len(lit) < len(names):
         black = ", ".join(name for k, name in enumerate(names) if k not in lit)
         log.warning("ps: black in the mask, and left out: %s; were these lamps on?", black)
         setup, values = setup.chosen(lit), values[:, : len(lit)]
-    doubts = compression.judged(folder, setup.names, mask).said()
+    doubts = files.doubts(folder, setup.names) + compression.judged(folder, setup.names, mask).said()
     few = every(values, JUDGED)
     if not setup.near and looks_encoded(
         few * setup.intensities.astype(np.float32), setup.names, setup.lights, setup.intensities
@@ -308,7 +316,11 @@ def read_setup(folder: Path, *, images: int = 0) -> Setup:
             "be as many of each"
         )
     if (intensities <= 0).any():
-        raise InputError(f"ps: {folder.name}: light {int((intensities <= 0).any(1).argmax()) + 1} has no intensity")
+        k = int((intensities <= 0).any(1).argmax())
+        raise InputError(
+            f"ps: {folder.name}: light {k + 1} has no intensity, all three must be above 0; if it was off, take it out "
+            f'of the files of the lights, and "{names[k]}" out of the folder or of {NAMES}'
+        )
     distance, away = (
         float(read_numbers(folder / name, 1)[0, 0]) if (folder / name).is_file() else None
         for name in (DISTANCE, LIGHT_DISTANCE)

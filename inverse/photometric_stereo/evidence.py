@@ -24,8 +24,8 @@ from .direct import DirectModel, Guess, own
 #: Part of the lights that are left out whole, and part of those of each block of pixels; its width, pixels.
 WHOLE, OF_BLOCKS, BLOCK = 0.1, 0.1, 8
 
-#: Fewest lights of which any can be left out: what is kept must be more than what is sought.
-FEWEST = 8
+#: Fewest lights of which any can be left out, for three must be kept; and of which any are left out whole.
+FEWEST, FEWEST_WHOLE = 4, 8
 
 #: Pixels by which an object is judged.
 JUDGED = 800
@@ -77,7 +77,7 @@ def left_out(data: Dataset, seed: int) -> np.ndarray:
     if K < FEWEST:
         return found
     rng = np.random.default_rng([seed, 17])
-    whole = max(round(WHOLE * K), 1)
+    whole = max(round(WHOLE * K), 1) if K >= FEWEST_WHOLE else 0
     lights = rng.permutation(K)
     found[:, lights[:whole]] = True
     rows, columns = np.nonzero(data.mask)
@@ -113,8 +113,9 @@ class Judge:
 
     @property
     def able(self) -> bool:
-        """Are there lights enough?"""
-        return bool(self.left.any())
+        """Are there lights enough, so that values are left out that count?"""
+        pixels = self.pixels()
+        return bool((self.left[pixels] & (self.counts[pixels] > 0)).any())
 
     def pixels(self) -> np.ndarray:
         """Numbers of those by which it judges, ascending."""

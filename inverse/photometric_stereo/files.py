@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import ExifTags, Image
 
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.inverse.targets import read_picture, srgb_to_linear
@@ -22,6 +25,9 @@ DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
     "distance.txt",
     "light_distance.txt",
 )
+
+#: Directions whose lengths differ by a larger factor may be more than directions.
+UNEVEN = 1.1
 
 #: What the names of pictures end with: of those that are decoded from sRGB, of whole numbers that are taken to be
 #: linear, and of all that are read.
@@ -60,9 +66,11 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
             got = line.strip() if len(line) < 60 else line.strip()[:57] + "..."
+            commas = "." not in line and re.search(r"\d,\d", line) is not None
             raise InputError(
                 f'ps: {path.name}, line {k}: expected {columns} finite number{"s" * (columns > 1)}, got "{got}"'
                 + "; take a header away, or begin it with #" * (not row)
+                + "; write decimals with a point" * (commas and len(row) > columns)
             )
         rows.append(row)
     if not rows:
@@ -71,8 +79,8 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
 
 
 def read_names(folder: Path) -> list[str]:
-    """Of the images of a folder: those that `filenames.txt` lists, else all pictures but masks and truths, by name,
-    where numbers count as such: 2 comes before 10.
+    """Of the images of a folder: those that `filenames.txt` lists, else all pictures but masks, truths and hidden
+    files, by name, where numbers count as such: 2 comes before 10.
 
     Raises
     ------
@@ -86,7 +94,9 @@ def read_names(folder: Path) -> list[str]:
             raise InputError(f'ps: {NAMES} lists "{twice[0]}" twice')
         return names
     other = lambda p: p.stem.lower().endswith("mask") or p.stem.lower() in ("normal_gt", "depth_gt")
-    names = [p.name for p in folder.iterdir() if p.suffix.lower() in KINDS and not other(p)]
+    hidden = lambda p: p.name.startswith(".")  # such as ._1.png, which macOS writes beside 1.png
+    pictures = (p for p in folder.iterdir() if p.suffix.lower() in KINDS and p.is_file())
+    names = [p.name for p in pictures if not (other(p) or hidden(p))]
     return sorted(names, key=lambda name: [int(w) if w.isdecimal() else w for w in re.split(r"(\d+)", name)])
 
 
@@ -119,6 +129,8 @@ def read_pixels(path: Path, mask: np.ndarray) -> np.ndarray:
             f'ps: "{path.name}" is of a format that is not read; make it EXR, PNG or TIFF (16 bits, linear), or JPEG'
         )
     picture = _numbers_of_picture(path)
+    if path.suffix.lower() in JPEG:
+        _check_upright(path)
     if picture.shape[:2] != mask.shape:
         (h, w), (H, W) = picture.shape[:2], mask.shape
         raise InputError(f'ps: "{path.name}" has {w} x {h} pixels, the mask {W} x {H}')
@@ -130,6 +142,49 @@ def read_pixels(path: Path, mask: np.ndarray) -> np.ndarray:
     if path.suffix.lower() in JPEG:
         pixels = srgb_to_linear(pixels)
     return np.broadcast_to(pixels, (len(pixels), 3))
+
+
+def _check_upright(path: Path) -> None:
+    """Raises ValueError if other programs show a JPEG file otherwise than its pixels are stored: its mask may be of
+    either."""
+    with Image.open(path) as picture:
+        turned = picture.getexif().get(ExifTags.Base.Orientation, 1)
+    if turned != 1:
+        raise InputError(
+            f'ps: "{path.name}" says (EXIF, orientation {turned}) that it must be turned to be shown; turn the pixels '
+            "of all pictures, or take this entry out of them, so that they are as mask.png and as the lights are meant"
+        )
+
+
+def doubts(folder: Path, names: Sequence[str]) -> list[str]:
+    """What the files of a folder and its pictures say of possible faults, in sentences. Raises what `dataset.read`
+    does."""
+    said = []
+    counts = Counter(kind(folder / name) for name in names)
+    if len(counts) > 1:
+        listed = " and ".join(f"{count} {of_kind}" for of_kind, count in counts.items())
+        said.append(
+            f"The pictures are of several kinds: {listed}. Only JPEG is decoded from sRGB, and PNG and TIFF of whole "
+            "numbers are divided by the largest one, EXR is not: export all pictures in the same way."
+        )
+    if not any((folder / name).is_file() for name in (LEDS, INTENSITIES)):
+        lengths = np.linalg.norm(read_numbers(folder / DIRECTIONS, 3), axis=1)
+        if lengths.max() > UNEVEN * lengths.min():
+            said.append(
+                f"The directions in {DIRECTIONS} have lengths from {lengths.min():.3g} to {lengths.max():.3g}, which "
+                f"do not count. If they are intensities, write these to {INTENSITIES}; if the lines are positions, "
+                "they must be relative to the object."
+            )
+    return said
+
+
+def kind(path: Path) -> str:
+    """Of a picture, in words, from its name and its header."""
+    suffix = path.suffix.lower()
+    if suffix != ".png":
+        return "EXR" if suffix == ".exr" else "JPEG" if suffix in JPEG else "TIFF"
+    with path.open("rb") as file:
+        return f"PNG of {file.read(25)[24]} bits"
 
 
 def _numbers_of_picture(path: Path) -> np.ndarray:

@@ -46,6 +46,7 @@ class Inspection:
     small : the images, shrunk, linear. mean : of all images, (H, W, 3), linear, with the mask beside it.
     compression : how far JPEG has changed values.
     misfits : of a diffuse surface to the images, as they are, and decoded from sRGB; None where this says nothing.
+    of_files : doubts about the files, in sentences.
     plausibility : are the data what their files say?
     """
 
@@ -64,6 +65,7 @@ class Inspection:
     mean: np.ndarray
     compression: Compression
     misfits: tuple[float, float] | None
+    of_files: tuple[str, ...]
     plausibility: Plausibility
     options: Options
 
@@ -152,6 +154,7 @@ def inspect(folder: Path, options: Options | None = None) -> Inspection:
         mean=mean,
         compression=compression.judged(folder, names, mask),
         misfits=_misfits(raw, setup),
+        of_files=tuple(files.doubts(folder, names)),
         plausibility=_plausibility(blocks, coarse, replace(setup, camera=dataset.coarser(setup.camera, step))),
         options=options,
     )
@@ -182,7 +185,7 @@ def warnings(found: Inspection) -> list[str]:
             f"A reconstruction would take {found.memory / 2**30:.1f} GiB of memory, of which {there / 2**30:.1f} GiB "
             "are available, and will be refused: use fewer --images, or --resolutions 0.25 0.5 with --iterations 10 6."
         )
-    said += found.compression.said() + found.plausibility.said()
+    said += [*found.of_files, *found.compression.said(), *found.plausibility.said()]
     if found.plausibility.order.known and found.misfits is not None and found.misfits[1] < found.misfits[0]:
         said.append(
             "The pictures look like exports for the screen (sRGB), and PNG and TIFF are taken to be linear: decoded, "
@@ -192,8 +195,8 @@ def warnings(found: Inspection) -> list[str]:
     said += _of_images(found)
     if found.images < evidence.FEWEST:
         said.append(
-            f"With fewer than {evidence.FEWEST} images, none can be left out to judge the result by: nothing protects "
-            "from a reconstruction that is worse than its start."
+            f"With fewer than {evidence.FEWEST} images, none can be left out to judge a result by: the start will be "
+            "kept, normals of a diffuse surface. Take more images."
         )
     if found.parts > 1:
         said.append(
@@ -246,7 +249,7 @@ def _estimates(sample: Dataset, options: Options) -> tuple[np.ndarray, np.ndarra
     plane = start.flat(sample)
     directions, irradiance = plane.lighting()
     if not sample.values.max() > 0:
-        raise InputError("ps: all images are black in the mask; check the images, their exposure and the mask")
+        raise InputError(dataset.ALL_BLACK)
     counts = np.ones(sample.values.shape[:2], np.float32)
     guess = start.guess(sample, ggx.Lobes((np.nan,), (np.nan,)), counts, options)
     values = sample.luminance / np.maximum(irradiance, 1e-30) / guess.exposures
@@ -292,19 +295,16 @@ def _of_images(found: Inspection) -> list[str]:
 
 def _bits(pictures: list[Path], raw: np.ndarray) -> str:
     """Of each channel, in words. The header of PNG tells them."""
-    kinds = {file.suffix.lower() for file in pictures}
-    if kinds == {".exr"}:
-        return "EXR, floating point"
-    if kinds <= {".tif", ".tiff"}:
-        return "TIFF" + ", 8 bits" * encoding.of_8_bits(raw)
-    if kinds != {".png"}:
-        return "JPEG, 8 bits" if kinds <= set(files.JPEG) else "of several formats"
-    depths = set()
-    for file in pictures:
-        with file.open("rb") as opened:
-            depths.add(opened.read(25)[24])
-    words = f"PNG, {' and '.join(map(str, sorted(depths)))} bits"
-    return words + " (only 8 are used)" * (depths == {16} and encoding.of_8_bits(raw))
+    kinds = {files.kind(file) for file in pictures}
+    if len(kinds) > 1:
+        return "of several kinds"
+    (kind,) = kinds
+    if kind == "TIFF":
+        return kind + ", 8 bits" * encoding.of_8_bits(raw)
+    if kind.startswith("PNG"):
+        of_8 = kind == "PNG of 16 bits" and encoding.of_8_bits(raw)
+        return kind.replace(" of", ",") + " (only 8 are used)" * of_8
+    return {"EXR": "EXR, floating point", "JPEG": "JPEG, 8 bits"}[kind]
 
 
 def _percent(part: float) -> str:

@@ -133,7 +133,8 @@ def write_pictures(folder: Path, result: Result) -> None:
 def judgement(result: Result) -> list[str]:
     """What the values that were left out say, in sentences; nothing before the last alternation."""
     if result.verdict == "not judged":
-        return ["too few lights to leave any out: the last alternation was kept"] if result.left_out else []
+        kept = "too few lights to leave any out: the start is kept, for nothing tells if another result is better"
+        return [kept] if result.left_out else []
     start, found = (f"{100 * result.left_out[name]:.3g} %" for name in ("start", "result"))
     if result.verdict == "start":
         return [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from . import axes, black_level, files, least_squares, lights_order, start
 from .axes import Axes
 from .black_level import BlackLevel
-from .dataset import LUMINANCE, Dataset
+from .dataset import LUMINANCE, Dataset, angles
 from .lights_order import Order
 from .rendering import unlit
 
@@ -23,14 +24,21 @@ PIXELS, FEWEST = 5000, 100
 DIM = 0.1
 
 
+#: Pictures are the same whose values differ at most by this part of the largest one: noise alone makes more. Their
+#: lights differ if they are more than so many degrees apart.
+SAME, APART = 1e-5, 1.0
+
+
 @dataclass(frozen=True)
 class Plausibility:
-    """file : of the lights."""
+    """file : of the lights. copies : names of pictures that are the same, though their lights differ, by how many
+    degrees."""
 
     file: str = files.DIRECTIONS
     order: Order = field(default_factory=Order)
     axes: Axes = field(default_factory=Axes)
     black_level: BlackLevel = field(default_factory=BlackLevel)
+    copies: tuple[tuple[str, str, float], ...] = ()
 
     def rows(self) -> list[tuple[str, str]]:
         """What, and how much."""
@@ -43,7 +51,12 @@ class Plausibility:
     def said(self) -> list[str]:
         """Warnings, with what to do, in sentences. Of lights in another order, axes tell nothing."""
         of_axes = [] if self.order.wrong else self.axes.said(self.file)
-        return [*self.order.said(self.file), *of_axes, *self.black_level.said()]
+        copies = [
+            f"The pictures {first} and {second} are the same, though their lights are {apart:.0f} degrees apart. Put "
+            "the right picture in the place of the copy, or take the copy and its light out."
+            for first, second, apart in self.copies
+        ]
+        return [*copies, *self.order.said(self.file), *of_axes, *self.black_level.said()]
 
 
 def judged(data: Dataset) -> Plausibility:
@@ -69,7 +82,22 @@ def judged(data: Dataset) -> Plausibility:
         lights_order.judged(values, lights, names, lit),
         axes.judged(data, least_squares.facing(found)) if len(lit) >= axes.FEWEST else Axes(),
         black_level.judged(pictured[:, lit], black_level.away(found, directions[..., lit, :])),
+        _copies(pictured, lights, names, lit),
     )
+
+
+def _copies(
+    pictured: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np.ndarray
+) -> tuple[tuple[str, str, float], ...]:
+    """Each picture that is a copy, with the first one that it equals. pictured : (P, K). lit : numbers of those that
+    are looked at."""
+    found, tolerance = {}, SAME * pictured.max()
+    for i, k in enumerate(lit):
+        off = np.abs(pictured[:, lit[i + 1 :]] - pictured[:, k, None]).max(0)
+        for j in lit[i + 1 :][off <= tolerance]:
+            if (apart := float(angles(lights[k], lights[j]))) > APART:
+                found.setdefault(j, (names[k], names[j], apart))
+    return tuple(found.values())
 
 
 def check(data: Dataset) -> tuple[str, ...]:

@@ -133,7 +133,8 @@ class Options:
 class Result:
     """normals : (P, 3). depth : (Q,), of the pixels of `domain`. weights : (B, 3), with `scale` the BSDF of the images.
     kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and so was kept;
-    "judged", if something else predicts better; "not judged", with too few lights to leave any out. left_out : how far
+    "judged", if something else predicts better; "not judged", with too few lights to leave any out, and the start was
+    kept. left_out : how far
     predictions of "start" and "result" are off, in the mean value of each pixel. halves : of both, the mean angle
     between normals of one half of the lights and of the other, degrees. curl : of both, that between normals and those
     of the depth that is integrated from them. taken_back : part of the surface whose normals are those of the start.
@@ -261,7 +262,8 @@ class Reconstruction:
             level = dataclasses.replace(level, values=level.values * np.float32(self.scale))
         counts = start.counts(self.data, level, size, options.dark)
         judge = Judge(level, self.lobes, left_out(level, options.seed), counts, options.seed, options.start)
-        plan = [(now.kind, options.iterations[now.level])]
+        # With too few lights to judge by, the start is kept, and one alternation tells how far it is off the images
+        plan = [(now.kind, options.iterations[now.level] if judge.able else 1)]
         if now.level == 0 and judge.able and len(self.kinds) > 1:
             plan += [(kind, SETTLED) for kind in self.kinds]
         elif now.level == len(options.resolutions) - 1 and judge.able:
@@ -339,7 +341,7 @@ class Reconstruction:
             now.first,
             self.scale,
             best.kind,
-            verdict="start" if best.start else "judged" if work.judge.able else "not judged",
+            verdict="not judged" if not work.judge.able else "start" if best.start else "judged",
             left_out={"start": now.start.left_out, "result": best.left_out},
             halves={"start": now.start.halves, "result": best.halves},
             curl={"start": now.start.curl, "result": best.curl},

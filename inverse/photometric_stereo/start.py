@@ -13,7 +13,7 @@ from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
 from . import calibration, least_squares
-from .dataset import Dataset, unit
+from .dataset import ALL_BLACK, Dataset, unit
 from .direct import DirectModel, Guess
 from .rendering import Domain, unlit
 
@@ -39,7 +39,7 @@ def check(data: Dataset) -> None:
     if not data.near:
         least_squares.check_lights(data.lights)
     if not data.values.max() > 0:
-        raise InputError("ps: all images are black in the mask; check the images, their exposure and the mask")
+        raise InputError(ALL_BLACK)
     if len(data.values) < FEWEST:
         raise InputError(f"ps: the mask has {len(data.values)} pixels, at least {FEWEST} are needed; check mask.png")
     if count := int(unlit(data).sum()):

@@ -353,7 +353,7 @@ def test_what_is_left_out(plastic: Scene) -> None:
     np.testing.assert_array_equal(left, left_out(plastic.data, 0))
     assert (left != left_out(plastic.data, 1)).any()
     few = dataclasses.replace(
-        plastic.data, values=plastic.data.values[:, :6], lights=plastic.data.lights[:6], intensities=np.ones((6, 3))
+        plastic.data, values=plastic.data.values[:, :3], lights=plastic.data.lights[:3], intensities=np.ones((3, 3))
     )
     assert not left_out(few, 0).any()
     judge = judge_of(plastic.data, plastic.rendering.lobes)

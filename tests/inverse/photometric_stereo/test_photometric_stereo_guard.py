@@ -178,7 +178,7 @@ def test_a_result_must_win_in_all() -> None:
     assert not state(0.11, 4.0, 1.0).beats(start)
     assert not state(0.09, 4.0, 3.1).beats(start)
     nothing = state(np.nan, np.nan, np.nan)
-    assert nothing.beats(nothing)
+    assert not nothing.beats(nothing)
 
 
 def test_other_materials_must_be_clearly_better() -> None:
@@ -342,6 +342,50 @@ def test_three_lights(matte: Dataset, method: str) -> None:
     lit = (few.values > 0).all((1, 2))
     found = least_squares.normals(few.luminance, few.lights, method)
     assert angles(found, matte.truth)[lit].mean() < 2
+
+
+@pytest.mark.parametrize("K", [3, 4, 5, 7])
+def test_few_lights_end_no_worse_than_they_start(K: int) -> None:
+    """Of two colours, which one material with a factor for each pixel ruins if nothing is judged."""
+    data = simulated(shape="folds", bsdf="diffuse:0.5,0.4,0.3|diffuse:0.2,0.3,0.5", lights=K, spread=45, seed=5)
+    options = ps.Options(**QUICK | {"iterations": (3,)}, materials="one", coat=False)
+    found = ps.reconstruct(data, options, progress=False)
+    counts = start.counts(data, data, 1.0, options.dark)
+    begun = start.guess(data, found.lobes, counts, options).normals
+    before = angles(begun, data.truth).mean()
+    if K == 3:
+        np.testing.assert_array_equal(found.guess.normals, begun)
+        assert found.verdict == "not judged" and "the start is kept" in output.judgement(found)[0]
+    else:
+        assert found.verdict in ("judged", "start") and np.isfinite(found.left_out["result"])
+        assert found.error < before + 0.05
+
+
+def test_what_is_left_out_of_few_lights() -> None:
+    """At least three values of each pixel are kept, and each light is left out somewhere."""
+    mask = np.ones((64, 64), bool)
+    for K, count in ((3, 0), (4, 1), (7, 1), (8, 2)):
+        data = Dataset(np.ones((64**2, K, 3), np.float32), mask, simulation.spiral(K, 40), np.ones((K, 3)))
+        left = left_out(data, 0)
+        assert (left.sum(1) == count).all() and left.all(0).sum() == (K >= 8)
+        assert left.any() == (K > 3) == left.any(0).all()
+
+
+def test_what_is_left_out_may_not_count() -> None:
+    """Of a small flat thing, the darkest value of all pixels: then nothing is judged, and nothing divided by 0."""
+    mask, lights = np.zeros((10, 10), bool), simulation.spiral(5, 40)
+    mask[:8, :8] = True
+    values = np.random.default_rng(0).normal(1, 1e-3, (64, 5, 3)) * (lights[:, 2:] / np.pi)
+    data = Dataset(values.astype(np.float32), mask, lights, np.ones((5, 3)))
+    darkest = lights[:, 2].argmin()
+    for seed in range(40):
+        left = left_out(data, seed)
+        found = ps.reconstruct(data, ps.Options(**QUICK, seed=seed), progress=False) if left[0, darkest] else None
+        if found is not None:
+            break
+    assert found.verdict == "not judged" and angles(found.guess.normals, [0, 0, 1]).mean() < 1
+    exact = alternation.State(None, None, Kind(), left_out=0.0)
+    assert exact.better_than(exact) and not dataclasses.replace(exact, left_out=0.1).better_than(exact)
 
 
 def test_darkest_values_of_few_lights() -> None:

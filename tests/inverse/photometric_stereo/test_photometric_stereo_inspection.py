@@ -56,7 +56,7 @@ def changed(data: Dataset, how: str) -> Dataset:
     elif how == "exposed":
         values[:, 3] *= 1.5
     elif how == "few":
-        values, lights, intensities = values[:, ::4], lights[::4], intensities[::4]
+        values, lights, intensities = values[:, -3:], lights[-3:], intensities[-3:]
     elif how == "pieces":
         mask = mask.copy()
         mask[:, N // 2] = False
