@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
-from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
+from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity
 
@@ -60,13 +60,17 @@ def scattered_light(
     directions: Directions | None = None,
     lights: LightChoice | None = None,
     fine_mirrors: FineMirrors | None = None,
+    horizon: Horizon | None = None,
+    seen: mi.Bool | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
-    beside_outline : is this vertex just inside of an outline? Then interpolated normals that face away are turned.
+    beside_outline : is this vertex, or what is seen through it, just inside of an outline? Then interpolated normals
+        that face away are turned.
     directions : see `Scattering.scatter`, for this vertex.
     lights : see `Scattering`.
     fine_mirrors : of which the normals are turned at this vertex.
+    horizon : see `PathTracer.radiance`. seen : does the camera see this vertex, through a veil? None: yes.
 
     Returns
     -------
@@ -75,12 +79,13 @@ def scattered_light(
         nothing was there?
     """
     scattering = Scattering(scene, attached=False, lights=lights)
-    first = mi.UInt32(vertex.depth)
 
-    def bounce(L, stopped, vertex, active, sampler):
+    def bounce(L, stopped, vertex, first, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         if beside_outline is not None:
             turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
+        if horizon is not None:
+            turn_to_side(si, vertex.ray, replace(horizon, side=dr.select(vertex.depth == first, horizon.side, 0)))
         if fine_mirrors is not None:
             fine_mirrors.turn(si, vertex.ray, active & (vertex.depth == first))
         there = directions.where(active & (vertex.depth == first)) if directions is not None else None
@@ -89,12 +94,14 @@ def scattered_light(
         L += dr.select(active, vertex.β * direct, 0)
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)
         stopped |= (active & ~onwards.through) | scattering.stops(onwards.ray, onwards.pi, sampler, last)
+        first += dr.select(onwards.through & (vertex.depth == first), mi.UInt32(1), 0)
         vertex, active = step(vertex, onwards, sampler, depths, active)
-        return L, stopped, vertex, active, sampler
+        return L, stopped, vertex, first, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
-    state = (dr.zeros(mi.Spectrum, dr.width(vertex.depth)), mi.Bool(False), vertex, active, sampler)
-    return dr.while_loop(state, lambda L, stopped, v, active, s: active, bounce, label="scattered light")[:2]
+    first = mi.UInt32(vertex.depth) if seen is None else dr.select(seen, vertex.depth, 0)
+    state = (dr.zeros(mi.Spectrum, dr.width(vertex.depth)), mi.Bool(False), vertex, first, active, sampler)
+    return dr.while_loop(state, lambda *state: state[-2], bounce, label="scattered light")[:2]
 
 
 def choose_vertex(
