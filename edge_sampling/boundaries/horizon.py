@@ -28,8 +28,6 @@ import numpy as np
 from rimlight.edge_sampling.geometry.device_edges import rounding
 from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
 
-from .veils import is_veil
-
 #: Cosine to the viewer of a normal just beside the horizon.
 BESIDE_HORIZON = 1e-4
 
@@ -166,13 +164,12 @@ class Horizons:
         self, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active
     ) -> mi.Bool:
         """Do rays that pass points of curves on their dark side see the faces in which these are, or at least a surface
-        that is dark, or a veil behind which they may be? Not so beside a silhouette that is closer than the rays look,
-        which has this jump already; nor where something hides the face, be it the next one of the same mesh. pi : what
-        the rays meet. Detached."""
+        that is dark? Not so beside a silhouette that is closer than the rays look, which has this jump already; nor
+        where something hides the face, be it the next one of the same mesh. pi : what the rays meet. Detached."""
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o)
         its_face = there & (si.prim_index == dr.gather(mi.UInt32, self._number, face))
-        return si.is_valid() & (its_face | (dr.dot(si.sh_frame.n, ray.d) > 0) | is_veil(si))
+        return si.is_valid() & (its_face | (dr.dot(si.sh_frame.n, ray.d) > 0))
 
 
 def _towards(p: mi.Point3f, n: mi.Vector3f, eye: mi.Point3f, far: bool) -> mi.Float:

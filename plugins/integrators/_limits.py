@@ -156,6 +156,13 @@ def veils(scene: mi.Scene, *, from_points: bool) -> list[str]:
             f"the derivative lacks the jumps of {', '.join(close)} in the light that arrives through them at what is "
             "close to them and moves past them; use bilinear bitmaps for their opacity."
         )
+    coarse = names(s for s in surfaces(scene) if (s not in through or not is_flat(s)) and fringe(s) > FRINGE)
+    if coarse and through:
+        limits.append(
+            f"the derivative is off at the outlines of {', '.join(coarse)} that are seen through "
+            f"{', '.join(names(through))}: interpolated normals turn away from the sensor there. Give them finer "
+            "meshes or face normals."
+        )
     return limits
 
 

@@ -247,7 +247,7 @@ class BoundarySearch:
         shows = self.depths.scatters(1)
         mirrors = [s for s in surfaces(scene) if is_mirror(s)] if shows else []
         # What is seen through veils lies where it is without them. So only what has no projection is looked for there.
-        chains = bool(mirrors) or (shows and has_veils(scene))
+        chains = bool(mirrors) or (self.depths.scatters(2) and has_veils(scene))
         textures = self._texture_lines(scene, moving, chains)
         shown = ShownShadows(scene) if chains and sppi and self.depths.scatters(2) else None
         shown = shown if shown is not None and len(shown) else None

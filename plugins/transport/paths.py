@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
-from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
+from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity
 
@@ -60,8 +60,6 @@ def scattered_light(
     directions: Directions | None = None,
     lights: LightChoice | None = None,
     fine_mirrors: FineMirrors | None = None,
-    horizon: Horizon | None = None,
-    seen: mi.Bool | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
@@ -70,7 +68,6 @@ def scattered_light(
     directions : see `Scattering.scatter`, for this vertex.
     lights : see `Scattering`.
     fine_mirrors : of which the normals are turned at this vertex.
-    horizon : see `PathTracer.radiance`. seen : does the camera see this vertex, through a veil? None: yes.
 
     Returns
     -------
@@ -84,8 +81,6 @@ def scattered_light(
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         if beside_outline is not None:
             turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
-        if horizon is not None:
-            turn_to_side(si, vertex.ray, replace(horizon, side=dr.select(vertex.depth == first, horizon.side, 0)))
         if fine_mirrors is not None:
             fine_mirrors.turn(si, vertex.ray, active & (vertex.depth == first))
         there = directions.where(active & (vertex.depth == first)) if directions is not None else None
@@ -99,7 +94,7 @@ def scattered_light(
         return L, stopped, vertex, first, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
-    first = mi.UInt32(vertex.depth) if seen is None else dr.select(seen, vertex.depth, 0)
+    first = mi.UInt32(vertex.depth)
     state = (dr.zeros(mi.Spectrum, dr.width(vertex.depth)), mi.Bool(False), vertex, first, active, sampler)
     return dr.while_loop(state, lambda *state: state[-2], bounce, label="scattered light")[:2]
 

@@ -126,9 +126,7 @@ class PathTracer:
                 start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight))
             chosen = self.lights, self.lamps
             return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, *chosen))
-        indirect, stopped = scattered_light(
-            scene, sampler, second, self.depths, active, lights=self.lights, horizon=horizon, seen=onwards.through
-        )
+        indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, lights=self.lights)
         return Radiance(L + dr.select(β != 0, indirect, 0), valid | (onwards.through & stopped))
 
     def first_hit(self, ray: mi.Ray3f, active: mi.Bool | bool) -> mi.PreliminaryIntersection3f:
