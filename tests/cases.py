@@ -32,6 +32,7 @@ from cuts import CURVES, CUTS
 from hidden_lights import HIDDEN
 from instances import INSTANCES
 from joints import JOINTS
+from leaves import LEAVES
 from mirrors import MIRRORS, ball_of_index
 from polished import POLISHED
 from random_scenes import ball
@@ -915,6 +916,7 @@ CASES = [
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=1024)
         for k, (*of, depth) in TOUCHING.items()
     ),
+    *(Case(k, *of, spp=256, runs=24, integrator=upto(depth), reference_spp=1024) for k, (*of, depth) in LEAVES.items()),
     *(
         Case(k, *of, spp=256, runs=16, integrator=upto(depth), reference_spp=4096)
         for k, (*of, depth) in POLISHED.items()

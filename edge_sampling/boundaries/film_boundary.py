@@ -21,7 +21,7 @@ import numpy as np
 
 from rimlight.edge_sampling.geometry.device_edges import line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
-from rimlight.edge_sampling.geometry.meshes import Geometry
+from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import inside_frame
 
@@ -30,6 +30,7 @@ from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import Horizon
 from .lune import Lune
 from .tracer import Tracer
+from .veils import is_veil
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class FilmBoundary:
     seams : do the seams of the texture coordinates of spheres, disks and cylinders count?
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("outlines", "lights"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("outlines", "lights", "veils"))  # for `dr.freeze`
 
     def __init__(
         self,
@@ -103,6 +104,7 @@ class FilmBoundary:
         seams: bool = False,
     ):
         self.lights = lights
+        self.veils = any(lets_rays_through(s) for s in (*geometry.meshes, *geometry.analytic, *geometry.others))
         self.outlines = FilmOutlines(geometry, edges, moving, soft=soft, seams=seams)
 
     @property
@@ -181,13 +183,24 @@ class FilmBoundary:
             active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
             n_dl = dr.select(active, n_dl, 0)
-            shared = outlines.lune(at, chosen, lights)
+            shared = self._lune(at, chosen, lights, p, rays, met)
             if tracer.shares_directions:
                 shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
             sensor_moves = at.projection.attached
             return BoundaryPoints(u, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
 
     # ---------------------- What is on their sides ----------------------
+
+    def _lune(self, at: Placed, chosen: Chosen, lights: mi.Vector4f | None, p, rays, met) -> Lune | None:
+        """See `FilmOutlines.lune`; not of edges that are seen through a veil, from which light goes on to them."""
+        lune = self.outlines.lune(at, chosen, lights)
+        if lune is None or not self.veils:
+            return lune
+        veiled = mi.Bool(False)
+        for ray, pi in zip(rays, met, strict=True):
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, lune.active)
+            veiled |= is_veil(si) & (dr.abs_dot(si.n, si.p - p) > rounding(p, ray.o))
+        return lune.where(~veiled)
 
     def _shared_directions(
         self, chosen: Chosen, lune: Lune | None, rays, met, horizons, active: mi.Bool

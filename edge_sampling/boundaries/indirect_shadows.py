@@ -23,11 +23,12 @@ import mitsuba as mi
 from rimlight.edge_sampling.choice.sampling import Reservoir, power_heuristic
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.geometry.meshes import is_smooth, pointer
-from rimlight.edge_sampling.parametrisation import material_point
+from rimlight.edge_sampling.parametrisation import Vicinity, material_point
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
 
 from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow, ShadowBoundary, fall, thrown
 from .tracer import ShadingPoint, Tracer
+from .veils import Veiled, has_veils
 
 #: Shadows in the light of lamps of which one is kept, in proportion to what it contributes if nothing hides it. In that
 #: of lights without size, one is taken as it comes: the borders of a shadow mostly contribute with opposite signs, and
@@ -77,7 +78,7 @@ class IndirectShadows(ShadowBoundary):
     hidden : is light hard to find? Then more shadows are compared, and `onwards` takes part.
     """
 
-    DRJIT_STRUCT = ShadowBoundary.DRJIT_STRUCT | dict.fromkeys(("candidates", "continues", "moving_shapes"))
+    DRJIT_STRUCT = ShadowBoundary.DRJIT_STRUCT | dict.fromkeys(("candidates", "continues", "veils", "moving_shapes"))
     at_first = False
 
     def __init__(
@@ -87,6 +88,8 @@ class IndirectShadows(ShadowBoundary):
         #: See `_chosen`. In the light of lights without size, one is taken as it comes, unless it is hidden.
         self.candidates = MANY if hidden else CANDIDATES if self.any_surface else 1
         self.continues = hidden
+        #: May points see shadows through surfaces that rays go through as if nothing was there?
+        self.veils = has_veils(scene)
         self.moving_shapes = None if moving is None else [pointer(s) for s in moving]
 
     def counts(self, emitter: mi.Emitter) -> bool:
@@ -106,16 +109,21 @@ class IndirectShadows(ShadowBoundary):
             shadow = fall(scene, light, edge)
             active = shadow.active & point.active & tracer.scatters(point.depth + 1)
             x = shadow.fallen.compute_surface_interaction(shadow.ray, mi.RayFlags.All, active)
-            join = _Join.of(scene, z, x, active)
+            join = _Join.of(scene, z, x, active, through=self.veils)
+            if self.veils:
+                join.active &= tracer.scatters(point.depth + 1 + join.veiled.count)
             if self.continues:
                 back = density_onwards(x, edge.ω, z, join)
-                later = (point.depth > 1) & dr.isfinite(point.density)
+                later = (point.depth > 1) & dr.isfinite(point.density) & dr.isfinite(join.pdf)
                 join.weight *= dr.select(later, power_heuristic(point.density, back), 1)
             view, met, jump, n_dl = self._boundary(tracer, light, edge, shadow, x, z, join)
-            far = point.vicinity.around(z.bsdf()).far(join.r2)
+            vicinity = point.vicinity.around(z.bsdf())
+            far = vicinity.far(join.r2)
         with dr.resume_grad():
             m = material_point(shadow.ray, shadow.fallen, view.active).p
             held = _held(z.p, m, x.n, join.ω, far, view.active)
+            if self.veils:
+                held = _held_by_veil(z.p, m, x.n, join, vicinity, held, view.active)
             return self._value(scene, placement, light, edge, shadow, view, met, m, held, jump, n_dl)
 
     def onwards(
@@ -250,6 +258,8 @@ class _Join:
 
     ω : unit vector from z to x. r2 : squared distance. pdf : density of x by area, as it is sampled from z.
     weight : mi.Spectrum, what z reflects of the radiance of an element of area at x. active : do they see each other?
+    veiled : what is between them; None: nothing may be. Where there is something, `pdf` is infinite: shadows in the
+        light of lamps are found from x alone.
     """
 
     ω: mi.Vector3f
@@ -257,10 +267,18 @@ class _Join:
     pdf: mi.Float
     weight: mi.Spectrum
     active: mi.Bool
+    veiled: Veiled | None = None
 
     @staticmethod
-    def of(scene: mi.Scene, z: mi.SurfaceInteraction3f, x: mi.SurfaceInteraction3f, active: mi.Bool) -> _Join:
-        """And let x be seen from there."""
+    def of(
+        scene: mi.Scene,
+        z: mi.SurfaceInteraction3f,
+        x: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+        *,
+        through: bool = False,
+    ) -> _Join:
+        """And let x be seen from there. through : through veils as well?"""
         d = x.p - dr.detach(z.p)
         r2 = dr.squared_norm(d)
         active = active & (r2 > 0)
@@ -268,8 +286,14 @@ class _Join:
         x.wi = x.to_local(-ω)
         f, pdf = z.bsdf().eval_pdf(mi.BSDFContext(), z, z.to_local(ω), active)
         active &= dr.any(f != 0)
-        active &= ~scene.ray_test(spawn_ray_to(scene, z, x.p), active)
-        cos_over_r2 = dr.abs_dot(x.n, ω) / r2
+        cos_over_r2, ray = dr.abs_dot(x.n, ω) / r2, spawn_ray_to(scene, z, x.p)
+        if through:
+            veiled = Veiled.along(scene, ray, active)
+            active &= dr.any(veiled.part != 0)
+            weight = f * veiled.part * dr.select(active, cos_over_r2, 0)
+            pdf = dr.select(veiled.count > 0, dr.inf, pdf * cos_over_r2)
+            return _Join(ω, r2, pdf, weight, active, veiled)
+        active &= ~scene.ray_test(ray, active)
         return _Join(ω, r2, pdf * cos_over_r2, f * dr.select(active, cos_over_r2, 0), active)
 
 
@@ -286,6 +310,25 @@ def _held(z: mi.Point3f, m: mi.Point3f, n: mi.Vector3f, ω: mi.Vector3f, far: mi
     plane with the normal n."""
     slid = z + ω * (dr.dot(m - z, n) / dr.select(active, dr.dot(ω, n), 1))
     return dr.lerp(slid, m, far)
+
+
+def _held_by_veil(
+    z: mi.Point3f,
+    m: mi.Point3f,
+    n: mi.Vector3f,
+    join: _Join,
+    vicinity: Vicinity,
+    held: mi.Point3f,
+    active: mi.Bool,
+) -> mi.Point3f:
+    """`_held`, but where a veil is before the point: the point that z sees through what is held on the veil."""
+    veiled = join.veiled
+    active = active & (veiled.count > 0)
+    on_veil = material_point(veiled.ray, veiled.first, active)
+    far = vicinity.far(dr.square(veiled.first.t))
+    d = _held(z, on_veil.p, dr.detach(on_veil.n), join.ω, far, active) - z
+    seen = z + d * (dr.dot(m - z, n) / dr.select(active, dr.dot(d, n), 1))
+    return dr.select(active, seen, held)
 
 
 @dataclass

@@ -39,6 +39,7 @@ from .lune import Lune, spreads
 from .near_lamps import share_at_first
 from .past_edges import look, turning
 from .tracer import ShadingPoint, Tracer
+from .veils import has_veils, is_veil
 
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
@@ -49,6 +50,9 @@ EMISSION = 2 / 3
 #: How much to prefer edges that stand still, for scattered light at points that stand still: they count only where what
 #: is seen past them moves.
 STILL = 0.2
+
+#: How much to prefer edges whose faces are both seen, where surfaces that let rays through may be before them.
+VEILED = 0.2
 
 #: Edges from which one is kept, in proportion to what it contributes if nothing hides it.
 CANDIDATES = 4
@@ -65,7 +69,7 @@ class ShadingBoundary:
         edges matter at all points.
     """
 
-    _NUMBERS = ("transmits", "glossy", "smooth", "soft", "emission", "emission_at_first", "several")
+    _NUMBERS = ("transmits", "glossy", "smooth", "soft", "veils", "emission", "emission_at_first", "several")
     _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
@@ -88,6 +92,8 @@ class ShadingBoundary:
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.transmits = any(f & mi.BSDFFlags.Transmission for f in flags)
         self.glossy = any(f & mi.BSDFFlags.Glossy for f in flags)
+        #: Are there surfaces that rays go through as if nothing was there?
+        self.veils = has_veils(scene)
         #: Are there interpolated normals?
         self.smooth = any(has_interpolated_normals(m) for m in geometry.meshes)
         #: Have all lights a size? Then what the planes of faces hide has one, too.
@@ -161,7 +167,7 @@ class ShadingBoundary:
                 division = _either(emitted, to_lamp, to_surface)
                 # Of the edges whose faces are both seen, emitted light counts only those on the borders of lamps, which
                 # the tree takes for open ones.
-                radius = dr.select(emitted, 0, division.vicinity.radius)
+                radius = dr.select(emitted, 0, dr.inf if self.veils else division.vicinity.radius)
                 ball = Vicinity(radius) if tracer.scatters(2) else None
                 cos = dr.select(emitted, cone.cos, -1)
                 towards = replace(view, cone=Cone(cone.axis, cos, cone.sin), vicinity=ball)
@@ -177,7 +183,9 @@ class ShadingBoundary:
                 f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
                 arc = dr.norm(dr.cross(d, outline.tangent)) * dr.rcp(r2)
                 seen_past = outline.outward(dr.cross(d, outline.tangent), d) != 0
-                crease = self.silhouettes.crease(e, outline) * (1 - division.held(r2, ω))
+                near = 1 - division.held(r2, ω)
+                near = dr.select(emitted, near, dr.maximum(near, VEILED)) if self.veils else near
+                crease = self.silhouettes.crease(e, outline) * near
                 # The closer an edge is, the faster its direction turns.
                 turn = dr.rsqrt(r2) * self.silhouettes.preferred(e, use)
                 return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
@@ -253,7 +261,7 @@ class ShadingBoundary:
             outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
             # Of a crease, both sides are faces of its own.
             near = dr.detach(1 - division.held(dr.square(distance), ω))
-            active &= (outward != 0) | (near > 0)
+            active &= (outward != 0) | (near > 0) | (~emission & self.veils)
             n_dl = dr.select(active, n_dl, 0)
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
@@ -262,29 +270,28 @@ class ShadingBoundary:
 
             past, side = outward != 0, dr.select(outward != 0, outward, 1)
             ray, pi, y, hidden, own = see(side, active)
-            active &= ~hidden & (past | own)
+            veiled = hidden & ~emission & is_veil(y) if self.veils else mi.Bool(False)
+            active &= veiled | (~hidden & (past | (own & (near > 0))))
             shines = active & emission & (past | (near > 0))
             L, from_lamp = self._emitted(tracer, point, y, ω, pdf, distance, shines, light, past & ~outline.is_line)
             valid = active & y.is_valid()
             again, lune, faces = sampler.clone(), None, mi.Spectrum(0)
             if tracer.scatters(2):
-                reflected, beside = valid & ~emission, None
-                if self.smooth:
-                    # Where only the planes of its faces hide something, light comes from between them.
-                    beside = ~past
-                    soft = beside & self.silhouettes.only_bends(sample) & spreads(y.bsdf()) & self.soft
-                    lune = Lune.between(outline.tangent, outline.normals, soft)
-                found = _found_from_points(point, p, y, ω, past & ~outline.is_line)
+                reflected = valid & ~emission
+                beside, lune = self._on_faces(sample, outline, y, past, veiled) if self.smooth else (None, None)
+                found = _found_from_points(point, p, y, ω, past & ~outline.is_line & ~veiled)
                 scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune, found)
                 L += dr.select(reflected, scattered, 0)
             if tracer.scatters(2) or tracer.lamps is not None:
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
-                seen = see(-side, active & (near > 0) & ~outline.is_line, slack=2)
-                other_L, of_faces = self._shown_by_faces(tracer, point, *seen, again, light, emission, lune)
+                seen = see(-side, active & (veiled | ((near > 0) & ~outline.is_line)), slack=2)
+                other_L, of_faces = self._shown_by_faces(tracer, point, *seen, again, light, emission, lune, veiled)
+                # Past all edges behind a veil, both sides slide. Of lines, each is one of two that are looked at.
+                L = dr.select(veiled, (L - other_L) * dr.select(outline.is_line, mi.Float(0.5), 1), L)
                 # What its own faces show, held in its direction in the vicinity.
-                faces = dr.select(of_faces, other_L - dr.select(past, 0, L), 0)
+                faces = dr.select(of_faces & ~veiled, other_L - dr.select(past, 0, L), 0)
                 faces = side * near * dr.select(active, f * faces, 0)
-            L, from_lamp = (dr.select(active & past, f * light, 0) for light in (L, from_lamp))
+            L, from_lamp = (dr.select(active & (past | veiled), f * light, 0) for light in (L, from_lamp))
             n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
@@ -299,11 +306,17 @@ class ShadingBoundary:
             value += from_lamp * (dr.detach(division.turns(dr.squared_norm(d), ω)) * edge - (1 - held) * turned)
             return faces * (edge - turned) - side * value
 
+    def _on_faces(self, sample: EdgeSample, outline, y, past, veiled) -> tuple[mi.Bool, Lune]:
+        """Where normals that face away are turned; and from where the light comes that only planes of faces hide."""
+        soft = ~past & ~veiled & self.silhouettes.only_bends(sample) & spreads(y.bsdf()) & self.soft
+        return ~past | veiled, Lune.between(outline.tangent, outline.normals, soft)
+
     def _shown_by_faces(
-        self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune
+        self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune, veiled
     ) -> tuple[mi.Spectrum, mi.Bool]:
-        """What arrives along a ray that `look` has made, from a surface on which the edge lies; and does it?"""
-        active = pi.is_valid() & ~hidden & own
+        """What arrives along a ray that `look` has made, from a surface on which the edge lies, or from a veil before
+        it; and does it?"""
+        active = pi.is_valid() & (veiled | (~hidden & own))
         L = self._radiance(tracer.scene, y, light, active & emission)
         if tracer.scatters(2):
             reflected = active & ~emission

@@ -13,6 +13,7 @@ from rimlight._plan import names
 from rimlight.edge_sampling import (
     Cracks,
     Geometry,
+    TextureLines,
     film_parts,
     jumping_textures,
     maps_in_steps,
@@ -123,13 +124,7 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
         limits.append(
             f'the derivative lacks the motion of {lacks}; give them a roughness, or set "sppi" to 0 to accept this.'
         )
-    through = names(s for s in surfaces(scene) if lets_rays_through(s))
-    if through and depths.scatters(2):
-        limits.append(
-            "the derivative lacks part of the motion of what is seen, and of what shines, through "
-            f"{', '.join(through)}; "
-            'cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
-        )
+    limits += veils(scene, from_points=from_points) if depths.scatters(2) else []
     casts = names(s for s in geometry.others if not s.is_emitter())
     if casts:
         limits.append(
@@ -137,6 +132,50 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             "light: their silhouettes are unknown. Replace them by meshes."
         )
     return limits
+
+
+def veils(scene: mi.Scene, *, from_points: bool) -> list[str]:
+    """What lacks of what is seen through surfaces that rays go through as if nothing was there."""
+    through = [s for s in surfaces(scene) if lets_rays_through(s)]
+    if through and not from_points:
+        return [
+            "the derivative lacks part of the motion of what is seen, and of what shines, through "
+            f'{", ".join(names(through))}; cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
+        ]
+    jump = [s for s in surfaces(scene) if through and len(TextureLines([s]))]
+    beyond = lambda s: names(v for v in through if v is not s or not is_flat(v))
+    limits = [
+        f"the derivative lacks the jumps of the textures of {names([s])[0]} where surfaces reflect them that see them "
+        f"through {', '.join(beyond(s))}; use bilinear bitmaps."
+        for s in jump
+        if beyond(s)
+    ]
+    close = names(s for s in jump if s in through)
+    if close:
+        limits.append(
+            f"the derivative lacks the jumps of {', '.join(close)} in the light that arrives through them at what is "
+            "close to them and moves past them; use bilinear bitmaps for their opacity."
+        )
+    coarse = names(s for s in surfaces(scene) if (s not in through or not is_flat(s)) and fringe(s) > FRINGE)
+    if coarse and through:
+        limits.append(
+            f"the derivative is off at the outlines of {', '.join(coarse)} that are seen through "
+            f"{', '.join(names(through))}: interpolated normals turn away from the sensor there. Give them finer "
+            "meshes or face normals."
+        )
+    return limits
+
+
+def is_flat(shape: Any) -> bool:
+    """Does it lie in one plane, so that nothing of it is seen through it?"""
+    if not shape.is_mesh():
+        return shape.class_name() == "Disk"
+    corners = vertices(shape).astype(np.float64)
+    return bool(np.linalg.matrix_rank(corners - corners.mean(0), tol=FLAT * np.ptp(corners, 0).max()) <= 2)
+
+
+#: How far the vertices of a mesh in one plane may be from it, relative to its size.
+FLAT = 1e-5
 
 
 def shut_in_lamps(scene: mi.Scene, moving: Moving) -> list[str]:

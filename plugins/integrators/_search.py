@@ -35,6 +35,7 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
+from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
@@ -233,18 +234,31 @@ class BoundarySearch:
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         what = moving.flags, moving.camera, moving.lights
-        mirrors = [s for s in surfaces(scene) if is_mirror(s)] if self.from_points and self.depths.scatters(1) else []
-        mirrors = bool(mirrors), FineMirrors(mirrors) if mirrors else None
-        textures = self._texture_lines(scene, moving, mirrors[0]) if self.from_points else None
-        shown = ShownShadows(scene) if mirrors[0] and sppi and self.depths.scatters(2) else None
-        shown = shown if shown is not None and len(shown) else None
-        chains = (*mirrors, textures, shown, Surfaces(scene) if mirrors[0] or textures else None)
+        chains = self._chains(scene, moving, sppi)
         lights = LightChoice.of(scene)
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights, deep, lamps)
 
+    def _chains(
+        self, scene: mi.Scene, moving: Moving, sppi: int
+    ) -> tuple[bool, FineMirrors | None, TextureLines | None, ShownShadows | None, Surfaces | None]:
+        """What has to be looked for on the film: see `Boundaries`, from `mirrors` on."""
+        if not self.from_points:
+            return False, None, None, None, None
+        shows = self.depths.scatters(1)
+        mirrors = [s for s in surfaces(scene) if is_mirror(s)] if shows else []
+        # What is seen through veils lies where it is without them. So only what has no projection is looked for there.
+        chains = bool(mirrors) or (self.depths.scatters(2) and has_veils(scene))
+        textures = self._texture_lines(scene, moving, chains)
+        shown = ShownShadows(scene) if chains and sppi and self.depths.scatters(2) else None
+        shown = shown if shown is not None and len(shown) else None
+        chains = bool(mirrors) or (chains and bool(textures or shown))
+        fine, met = FineMirrors(mirrors) if mirrors else None, Surfaces(scene) if chains or textures else None
+        return chains, fine, textures, shown, met
+
     @staticmethod
     def _texture_lines(scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
-        """The lines of textures, and of what lights throw, that move as seen from the camera, or in mirrors."""
+        """The lines of textures, and of what lights throw, that move as seen from the camera, or in mirrors and
+        through veils."""
         shapes = surfaces(scene) if mirrors else dict.fromkeys(inner(s) for s in moving.with_lines)
         everywhere = mirrors or moving.camera or moving.lights
         lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes)

@@ -53,7 +53,7 @@ NEXT = 4
 BESIDE_TEXTURE = 64
 
 #: What is looked for, in plans.
-WHAT = ("perfect mirrors or glass", "textures or beams that jump")
+WHAT = ("perfect mirrors, glass or veils", "textures or beams that jump")
 
 #: Most rays that one sample traces besides those of a path: for plans.
 RAYS = 2 * (3 * CANDIDATES + 11)

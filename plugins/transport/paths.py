@@ -63,7 +63,8 @@ def scattered_light(
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
-    beside_outline : is this vertex just inside of an outline? Then interpolated normals that face away are turned.
+    beside_outline : is this vertex, or what is seen through it, just inside of an outline? Then interpolated normals
+        that face away are turned.
     directions : see `Scattering.scatter`, for this vertex.
     lights : see `Scattering`.
     fine_mirrors : of which the normals are turned at this vertex.
@@ -75,9 +76,8 @@ def scattered_light(
         nothing was there?
     """
     scattering = Scattering(scene, attached=False, lights=lights)
-    first = mi.UInt32(vertex.depth)
 
-    def bounce(L, stopped, vertex, active, sampler):
+    def bounce(L, stopped, vertex, first, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         if beside_outline is not None:
             turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
@@ -89,12 +89,14 @@ def scattered_light(
         L += dr.select(active, vertex.β * direct, 0)
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)
         stopped |= (active & ~onwards.through) | scattering.stops(onwards.ray, onwards.pi, sampler, last)
+        first += dr.select(onwards.through & (vertex.depth == first), mi.UInt32(1), 0)
         vertex, active = step(vertex, onwards, sampler, depths, active)
-        return L, stopped, vertex, active, sampler
+        return L, stopped, vertex, first, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
-    state = (dr.zeros(mi.Spectrum, dr.width(vertex.depth)), mi.Bool(False), vertex, active, sampler)
-    return dr.while_loop(state, lambda L, stopped, v, active, s: active, bounce, label="scattered light")[:2]
+    first = mi.UInt32(vertex.depth)
+    state = (dr.zeros(mi.Spectrum, dr.width(vertex.depth)), mi.Bool(False), vertex, first, active, sampler)
+    return dr.while_loop(state, lambda *state: state[-2], bounce, label="scattered light")[:2]
 
 
 def choose_vertex(

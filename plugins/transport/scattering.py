@@ -401,6 +401,7 @@ def next_vertex(
         bs.wo, bs.pdf = dr.select(directions.active, si.to_local(ω), bs.wo), dr.select(directions.active, pdf, bs.pdf)
         there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & directions.active) / pdf
         weight = dr.select(directions.active, there, weight)
+        bs.sampled_type = dr.select(directions.active, 0, bs.sampled_type)
     active = active & dr.any(weight != 0)
     through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
     ray = spawn_ray(scene, si, si.to_world(bs.wo), through)

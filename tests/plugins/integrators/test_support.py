@@ -18,6 +18,7 @@ from typing import Any
 
 import cases
 import drjit as dr
+import leaves
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -636,6 +637,21 @@ def test_thin_glass_changes():
     assert_exact("thin_glass", stage({"thing": glass, "lamp": back}), "thing.bsdf.eta", 0.02, 512, direction=[1])
 
 
+def test_what_is_seen_through_polarisers():
+    """As through nothing, but for the part of the light that they let through."""
+
+    def derivative(kind: str, **options: float) -> np.ndarray:
+        scene = leaves.beside_leaf(lambda: {"type": kind, **options})()
+        motion, made = Motion(scene, **leaves.GLOW), mi.load_dict({"type": "prb_edge", "max_depth": 3})
+        return np.array(derivative_image(scene, made, motion, spp=16, seed=1), float)
+
+    nothing, black = derivative("null"), derivative("polarizer", transmittance=0.0)
+    through = nothing - black
+    assert np.abs(through).sum() > 0.5 * np.abs(nothing).sum()
+    for kind, part in (("polarizer", 0.5), ("retarder", 1), ("circular", 0.5)):
+        assert np.abs(derivative(kind) - black - part * through).sum() < 1e-3 * np.abs(through).sum()
+
+
 @pytest.mark.parametrize("column", ["moves", "changes", "passed"])
 def test_colours_in_space(column):
     key = {"moves": "thing.vertex_positions", "changes": VOXELS, "passed": "plate.vertex_positions"}[column]
@@ -776,9 +792,6 @@ def second_sensor(kind: str, moves: str = "") -> Message:
     return Message(things, SENSOR, moves or "second.to_world")
 
 
-THROUGH = "what shines, through"
-POLARISERS = ("polarizer", "retarder", "circular")
-
 #: By row, what is said when it moves, and when it is passed.
 #: By row, or by row and column where the columns differ.
 MESSAGES = {
@@ -809,9 +822,9 @@ MESSAGES = {
     "`sunsky`": [in_lamp("sunsky", "border of the sun")],
     "`timed_sunsky`": [in_lamp("timed", TIMED)],
     "`volume` that shows a `gridvolume`, `nearest`": [material(lambda: volume("nearest"), "jumps of the textures")],
-    "`mask` in `prb_edge`": [material(mask, THROUGH, deep=True)],
-    "`null` in `prb_edge`": [material(bsdf("null"), THROUGH, deep=True)],
-    "`polarizer`, `retarder`, `circular` in `prb_edge`": [material(bsdf(k), THROUGH, deep=True) for k in POLARISERS],
+    "`mask` whose opacity jumps, in `prb_edge`": [
+        material(lambda: leaves.mask(leaves.opacity("nearest", 0, 1)), 'lacks the jumps of "thing" in', deep=True)
+    ],
 }
 #: By row, what changes, and is warned about.
 CHANGES = {
@@ -838,6 +851,13 @@ ELSEWHERE = {
     ],
     "`fisheye`": ["fisheye_cube", "fisheye_camera", "fisheye_camera_rotation", "fisheye_field_of_view"],
     "`batch` of the above": ["batch_cube", "batch_camera"],
+    "`mask` in `prb_edge`": [
+        "veil_glow", "veil_cube", "veil_camera", "veil_opacity", "leaf_moves", "behind_veil_point",
+        "behind_veil_checkers",
+    ],
+    "`mask` whose opacity jumps, in `prb_edge`": ["leaf_shadow"],
+    "`null` in `prb_edge`": ["null_glow"],
+    "`polarizer`, `retarder`, `circular` in `prb_edge`": [test_what_is_seen_through_polarisers],
     "`thindielectric`": [test_thin_glass_changes],
     "`glass`": ["glass_index"],  # otherwise as `dielectric`: see test_glass.py
     "`merl`": [test_measured_material],

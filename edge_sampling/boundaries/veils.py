@@ -1,0 +1,56 @@
+"""Surfaces that rays go through as if nothing was there, such as opacity masks: veils."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from rimlight.edge_sampling.geometry.meshes import lets_rays_through, surfaces
+from rimlight.edge_sampling.rays import spawn_ray
+
+
+def has_veils(scene: mi.Scene) -> bool:
+    return any(lets_rays_through(s) for s in surfaces(scene))
+
+
+def is_veil(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    return si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
+
+
+@dataclass
+class Veiled:
+    """What veils let through of the light along rays that end.
+
+    part : mi.Spectrum, of the light; 0 where something else is in the way.
+    count : mi.UInt32, number of the veils.
+    ray, first : the ray, and what it meets first. Detached.
+    """
+
+    part: mi.Spectrum
+    count: mi.UInt32
+    ray: mi.Ray3f
+    first: mi.PreliminaryIntersection3f
+
+    @staticmethod
+    def along(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> Veiled:
+        first = scene.ray_intersect_preliminary(ray, active=active)
+
+        def go_on(ray, pi, part, count, active):
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            through = active & is_veil(si)
+            part *= dr.select(active, dr.select(through, si.bsdf().eval_null_transmission(si, through), 0), 1)
+            count += dr.select(active, mi.UInt32(1), 0)
+            active = through & dr.any(part != 0)
+            beyond = spawn_ray(scene, si, ray.d, True)
+            beyond.maxt = ray.maxt - dr.norm(beyond.o - ray.o)
+            pi = scene.ray_intersect_preliminary(beyond, active=active)
+            return beyond, pi, part, count, active & pi.is_valid()
+
+        width = dr.width(active)
+        state = (mi.Ray3f(ray), first, dr.full(mi.Spectrum, 1, width), dr.zeros(mi.UInt32, width))
+        _, _, part, count, _ = dr.while_loop(
+            (*state, active & first.is_valid()), lambda *state: state[-1], go_on, label="veils"
+        )
+        return Veiled(part, count, ray, first)
