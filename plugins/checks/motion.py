@@ -31,7 +31,7 @@ class Motion:
 
     Raises
     ------
-    ValueError : the key is unknown, or numbers are missing, too many, or not finite.
+    ValueError : the key is unknown or has no derivative, or numbers are missing, too many, or not finite.
     """
 
     def __init__(
@@ -56,8 +56,8 @@ class Motion:
         self.is_positions = is_positions_key(key)
         self.is_transform = key.endswith("to_world")
         self.is_tensor = dr.is_tensor_v(value)
-        if not (self.is_positions or self.is_transform or dr.is_float_v(value)):
-            raise InputError(f'"{key}" is of type {type(value).__name__}, it cannot be varied continuously')
+        if not (self.is_positions or self.is_transform or (dr.is_diff_v(value) and dr.is_float_v(value))):
+            raise InputError(f'"{key}" is of type {type(value).__name__}, which has no derivative')
         if rotate is not None and not (self.is_positions or self.is_transform):
             raise InputError(f'"{key}" cannot rotate: it is neither vertex positions nor a transformation')
         if vertices is not None and not self.is_positions:

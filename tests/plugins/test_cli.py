@@ -133,6 +133,7 @@ def test_bad_scenes(capfd, folder, tmp_path, name, culprits):
         ([*MOVE, "--vertices", "0,7"], ["0 … 2", "7"]),
         ([*MOVE, "--vertices", "0,a"], ["--vertices", '"0,a"']),
         (["--param", "green.bsdf.reflectance.value", "--rotate", "0,0,1"], ["cannot rotate"]),
+        (["--param", "camera.near_clip", "--direction", "1"], ['"camera.near_clip" is of type float, which has no']),
         ([*MOVE, "--spp", "0"], ["--spp must be >= 1, got 0"]),
         ([*MOVE, "--spp", "-4"], ["--spp must be >= 1, got -4"]),
         ([*MOVE, "--seed", "-1"], ["--seed must be >= 0"]),
