@@ -134,10 +134,10 @@ class Result:
     """normals : (P, 3). depth : (Q,), of the pixels of `domain`. weights : (B, 3), with `scale` the BSDF of the images.
     kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and so was kept;
     "judged", if something else predicts better; "not judged", with too few lights to leave any out, and the start was
-    kept. left_out : how far
-    predictions of "start" and "result" are off, in the mean value of each pixel. halves : of both, the mean angle
-    between normals of one half of the lights and of the other, degrees. curl : of both, that between normals and those
-    of the depth that is integrated from them. taken_back : part of the surface whose normals are those of the start.
+    kept. left_out : how far predictions of "start" and "result" are off, in the mean value of each pixel. halves :
+    of both, the mean angle between normals of one half of the lights and of the other, degrees. curl : of both,
+    that between normals and those of the depth that is integrated from them. taken_back : part of the surface whose
+    normals are those of the start.
     strength : by which factor interreflections were multiplied, for shadows to be as they are in the images; NaN if
     there are too few of these, and so they were left as they are.
     doubts : what is probably wrong with the data, in sentences. history : for each alternation, the size of the images,

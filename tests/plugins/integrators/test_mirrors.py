@@ -27,6 +27,7 @@ INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb
         (mirrors.mapped_ball, "ball.vertex_positions"),
         (mirrors.mapped_ball, "ball.bsdf.normalmap.data"),
         (mirrors.bumpy_ball, "ball.to_world"),
+        (mirrors.rippled_mirror, "cube.vertex_positions"),
     ],
 )
 def test_gradients_are_those_of_forward_mode(name, make, key):
@@ -37,7 +38,7 @@ def test_gradients_are_those_of_forward_mode(name, make, key):
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
-@pytest.mark.parametrize("make", [mirrors.over_mirror, mirrors.shadow_in_wall])
+@pytest.mark.parametrize("make", [mirrors.over_mirror, mirrors.shadow_in_wall, mirrors.rippled_mirror])
 def test_frozen_functions(name, make):
     assert_frozen_is_unfrozen(make(), mi.load_dict(INTEGRATORS[name]), "cube.vertex_positions")
 
