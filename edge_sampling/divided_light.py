@@ -46,16 +46,10 @@ class DividedLight:
     def of(scene: mi.Scene, moving: Sequence[mi.Shape] | None = None) -> DividedLight | None:
         """None where all light is held at its points. On the host, so not in frozen functions.
 
-        moving : the shapes that move; None: all, or the camera, or lights.
+        moving : the shapes of which lobes may turn: by their own motion, or that of what looks at them. None: all.
         """
         found = DividedLight(CloseLamps.of(scene), NarrowLobes.of(scene, moving))
         return found if found.close is not None or found.lobes is not None else None
-
-    @property
-    def behind_first(self) -> DividedLight | None:
-        """The same behind the first vertex of a path. There, nothing turns with lobes: what blurs them serves as well
-        for light that is held at its points."""
-        return None if self.close is None else DividedLight(self.close, None)
 
     @property
     def shapes(self) -> list[mi.Shape]:
@@ -97,8 +91,7 @@ class NarrowLobes:
 
     @staticmethod
     def of(scene: mi.Scene, moving: Sequence[mi.Shape] | None = None) -> NarrowLobes | None:
-        """None where there are none, or none that moves relative to the camera or the lights. On the host, so not in
-        frozen functions.
+        """None where there are none, or none that may turn. On the host, so not in frozen functions.
 
         moving : see `DividedLight.of`.
         """
@@ -131,12 +124,18 @@ class NarrowLobes:
 
     def at(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> Turning:
         """That of the BSDF at a point, around the direction of mirror reflection; its axis follows `si`."""
-        n, v = mi.Vector3f(si.sh_frame.n), si.to_world(si.wi)
         with dr.suspend_grad():
             at = dr.detach(si)
             mirrored = mi.Vector3f(-at.wi.x, -at.wi.y, at.wi.z)
             width = width_of(at, bsdf, mirrored, active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection))
-        return Turning(2 * dr.dot(n, v) * n - v, width, mi.Float(dr.inf))
+        return Turning(axis_of(si), width, mi.Float(dr.inf))
+
+
+def axis_of(si: mi.SurfaceInteraction3f) -> mi.Vector3f:
+    """The direction of mirror reflection at a point, about the shading normal: a unit vector, world space. It follows
+    `si`."""
+    n, v = mi.Vector3f(si.sh_frame.n), si.to_world(si.wi)
+    return 2 * dr.dot(n, v) * n - v
 
 
 def width_of(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, axis: mi.Vector3f, active: mi.Bool) -> mi.Float:

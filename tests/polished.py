@@ -63,10 +63,23 @@ def wall() -> mi.Scene:
     )
 
 
+def caustic() -> mi.Scene:
+    """A matt floor, and a metal cube that throws the light of a lamp on it."""
+    lamp = quad((-1.3, 0.7, -0.3), (0.3, 0.5, 0), (0, 0, 0.6), "lamp", bsdf=diffuse(0.0), emitter=light(9, 8, 7))
+    return scene(
+        sensor=camera((0.3, 1.2, -2.2), (0, 0, 0.2)),
+        floor=horizontal((0, 0, 0), 1.5, "floor", bsdf=diffuse(0.6)),
+        cube=cube("cube", 0.25, (0.1, 0.35, 0.2), bsdf=metal(0.1)),
+        lamp=lamp,
+    )
+
+
 CAMERA_ALONG = {"key": "sensor.to_world", "direction": [1, 0, 0]}
 CAMERA_TURNS = {"key": "sensor.to_world", "rotate": [0, 1, 0]}
+FLOOR_RISES = {"key": "floor.vertex_positions", "direction": [0, 1, 0]}
 FLOOR_TILTS = {"key": "floor.vertex_positions", "rotate": [0.2, 0, 1]}
 LAMP_ALONG = {"key": "lamp.vertex_positions", "direction": [1, 0.3, 0]}
+CUBE_TURNS = {"key": "cube.vertex_positions", "rotate": [0, 1, 0]}
 WALL_TILTS = {"key": "wall.vertex_positions", "rotate": [0.3, 1, 0]}
 
 #: Of each case: scene, motion, step, longest path.
@@ -75,6 +88,8 @@ POLISHED = {
     "polished_lamp": (floor, LAMP_ALONG, 5e-3, 2),
     "polished_floor": (floor, FLOOR_TILTS, 3e-3, 4),
     "polished_wall": (wall, WALL_TILTS, 3e-3, 3),
+    "polished_cube": (caustic, CUBE_TURNS, 4e-2, 3),
+    "polished_rises": (wall, FLOOR_RISES, 3e-3, 3),
     "polished_sky": (sky, CAMERA_ALONG, 5e-3, 2),
     "lacquer_camera": (table, CAMERA_ALONG, 5e-3, 2),
 }

@@ -79,7 +79,6 @@ class IndirectShadows(ShadowBoundary):
     """
 
     DRJIT_STRUCT = ShadowBoundary.DRJIT_STRUCT | dict.fromkeys(("candidates", "continues", "veils", "moving_shapes"))
-    at_first = False
 
     def __init__(
         self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None = None, *, hidden: bool = False

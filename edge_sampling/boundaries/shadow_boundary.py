@@ -84,9 +84,6 @@ class ShadowBoundary:
         ("silhouettes", "lights", "smooth_lamps", "chosen", "any_surface", "any_other", "spots")
     )
 
-    #: Does the sensor see the shadows itself, at the first vertices of paths?
-    at_first = True
-
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes):
         self.silhouettes = silhouettes
         self.lights, self.smooth_lamps = Lights(scene), SmoothLamps(scene)
@@ -307,8 +304,7 @@ class ShadowBoundary:
             r2 = dr.squared_norm(to_light)
             Le = light.emitter.eval(on_light, emitting) * (cos / r2)
             if tracer.lamps is not None:
-                turning = tracer.lamps.turning(si, si.bsdf(), active) if self.at_first else None
-                division = tracer.lamps.at(turning, light.emitter)
+                division = tracer.lamps.at(tracer.lamps.turning(si, si.bsdf(), active), light.emitter)
                 view.slid = 1 - division.vicinity.far(r2)
                 # What turns with lobes is found from what is lit.
                 Le *= 1 - division.turns(r2, ω_x)

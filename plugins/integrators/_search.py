@@ -273,7 +273,8 @@ class BoundarySearch:
             return None, None, (), None
         everything = moving.camera or moving.lights
         shapes = None if everything else list(moving.shapes)
-        lamps = DividedLight.of(scene, shapes) if self.from_points and not self.geometry.others else None
+        turning = None if self.depths.scatters(2) else shapes  # what a surface that moves lights may stand still
+        lamps = DividedLight.of(scene, turning) if self.from_points and not self.geometry.others else None
         flags, divided = None if everything else moving.flags, lamps.shapes if lamps is not None else ()
         silhouettes = Silhouettes(self.geometry, self._edges_and_lines, flags, divided)
         if not len(silhouettes):

@@ -107,7 +107,7 @@ def choose_vertex(
     vicinity: Vicinity,
     active: mi.Bool,
     note: Callable[[Vertex, Numbers, Next, mi.Bool], None],
-) -> tuple[Vertex, mi.Bool, mi.UInt32, mi.Float]:
+) -> tuple[Vertex, mi.Bool, mi.UInt32, mi.UInt32, mi.Float]:
     """Follow paths from their first vertex, and keep one vertex of each, in proportion to its throughput (a reservoir
     of one); its β is divided by its probability.
 
@@ -118,38 +118,39 @@ def choose_vertex(
     vertex : with a ray that is detached.
     chosen : mi.Bool, is there one?
     since : mi.UInt32, number of the last vertex up to there that does not slide with those before; 1 if all do.
+    before : mi.UInt32, the same of the vertex before.
     density : mi.Float, by area, with which it was found from the vertex before; infinite if that is a mirror.
     """
 
-    def bounce(total, kept, kept_since, kept_density, vertex, since, density, active, sampler):
+    def bounce(total, kept, kept_since, kept_before, kept_density, vertex, since, before, density, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         bsdf = si.bsdf(vertex.ray)
         w = dr.select(active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth), dr.max(vertex.β), 0)
         total += w
         taken = sampler.next_1d(active) * total < w
         kept, kept_since = dr.select(taken, vertex, kept), dr.select(taken, since, kept_since)
+        kept_before = dr.select(taken, before, kept_before)
         kept_density = dr.select(taken, density * dr.abs_dot(si.n, vertex.ray.d), kept_density)
         numbers = Numbers(mi.Point2f(0), sampler.next_1d(active), sampler.next_2d(active))
         bs, onwards = next_vertex(scene, si, bsdf, numbers, active & depths.scatters(vertex.depth + 1), vicinity)
         note(vertex, numbers, onwards, active)
         r2 = dr.square(onwards.pi.t)
         slides = onwards.slides | (vicinity.far(r2) < 1)
-        since = dr.select(slides, since, vertex.depth + 1)
+        before, since = since, dr.select(slides, since, vertex.depth + 1)
         density = dr.select(onwards.mirrored, dr.inf, bs.pdf / r2)
         vertex, active = step(vertex, onwards, sampler, depths, active)
-        return total, kept, kept_since, kept_density, vertex, since, density, active, sampler
+        return total, kept, kept_since, kept_before, kept_density, vertex, since, before, density, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
     width = dr.width(vertex.depth)
     one, zero = dr.full(mi.UInt32, 1, width), dr.zeros(mi.Float, width)
-    total, kept, since, density, *_ = dr.while_loop(
-        (mi.Float(zero), vertex, one, mi.Float(zero), vertex, mi.UInt32(one), mi.Float(zero), active, sampler),
-        lambda *state: state[-2],
-        bounce,
-        label="choice of a vertex",
+    none = mi.Float(zero), vertex, one, mi.UInt32(one), mi.Float(zero)
+    first = vertex, mi.UInt32(one), mi.UInt32(one), mi.Float(zero)
+    total, kept, since, before, density, *_ = dr.while_loop(
+        (*none, *first, active, sampler), lambda *state: state[-2], bounce, label="choice of a vertex"
     )
     kept.β *= dr.select(total > 0, total / dr.max(kept.β), 0)
-    return kept, total > 0, since, density
+    return kept, total > 0, since, before, density
 
 
 def step(vertex, onwards, sampler, depths, active):

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
-from rimlight.edge_sampling.divided_light import DividedLight
+from rimlight.edge_sampling.divided_light import DividedLight, axis_of
 from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
 from rimlight.edge_sampling.refusals import Refusal
 
@@ -44,7 +44,7 @@ class Chain:
     """The vertices of paths behind the first, as they move.
 
     vicinity : in which they slide.
-    lights : see `Scattering`. lamps : how their light is divided at the first vertex.
+    lights, lamps : see `Scattering`.
     """
 
     def __init__(
@@ -54,8 +54,7 @@ class Chain:
         lights: LightChoice | None = None,
         lamps: DividedLight | None = None,
     ):
-        behind_first = None if lamps is None else lamps.behind_first
-        self.scattering = Scattering(scene, attached=True, lights=lights, lamps=behind_first)
+        self.scattering = Scattering(scene, attached=True, lights=lights, lamps=lamps)
         self.vicinity = vicinity
 
     def surface(self, vertex: Vertex, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -224,7 +223,8 @@ class MovingVertex:
     log : the path up to it; and one vertex more, if `onwards`.
     vertex, active, since : see `choose_vertex`.
     onwards : is the direction to the vertex beyond wanted, too? It is `d`, with gradients of its own.
-    lamps : see `Chain`. With the lobes of the first vertices, directions are `turning`, with gradients of their own.
+    lamps : see `Chain`. With the lobes of the vertices, directions are `turning`, with gradients of their own.
+    before : as `since`, of the vertex before, which looks at this one. Only needed with `lamps`.
     """
 
     def __init__(
@@ -240,6 +240,7 @@ class MovingVertex:
         *,
         onwards: bool = False,
         lamps: DividedLight | None = None,
+        before: mi.UInt32 | None = None,
     ):
         self.chain, self.first, self.log, self.vicinity = chain, first, log, chain.vicinity
         self.vertex, self.active, self.since = vertex, active, since
@@ -248,27 +249,27 @@ class MovingVertex:
         self._last = self.depth + 1 if onwards else self.depth
         self._start(ray)
         at_first = self.depth == 1
-        turning, self._axis = None, mi.Vector3f(0)
-        if lamps is not None:
-            with dr.resume_grad():
-                turning = lamps.turning(self.at_first, self.at_first.bsdf(), active & at_first)
-        if turning is not None:
-            self._axis = turning.axis
         with dr.suspend_grad():
             other = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
             self.si = dr.select(at_first, dr.detach(self.at_first), other)
             beyond = log.vertex(self._last, active).ray.d
-        self.p, self.n, self.d, axis = self.leaves = leaves(self.si.p, self.si.n, beyond, self._axis)
+            turning = None if lamps is None else lamps.turning(self.si, self.si.bsdf(), active)
+            #: Do lobes turn? Then it matters from where a vertex is looked at, though it does not slide.
+            self._turns = turning is not None
+            if turning is not None:
+                self.since = dr.select(turning.anywhere & ~at_first, before, since)
+        axis = turning.axis if turning is not None else mi.Vector3f(0)
+        self.p, self.n, self.d, axis = self.leaves = leaves(self.si.p, self.si.n, beyond, axis)
         with dr.resume_grad():
             self.si.p, self.si.n = self.p, self.n
             self.turning = turning and replace(turning, axis=axis)
             if mode == dr.ADMode.Forward:
                 first = self.at_first
-                δp, δn, δo, δd, δaxis = derivatives(first.p, first.n, self.start.o, self.start.d, self._axis)
-                moved = *self._forward(δo, δd), mi.Vector3f(0)
-                for leaf, here, later in zip(self.leaves, (δp, δn, δd, δaxis), moved, strict=True):
-                    dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(here), later))
-                self.at_first = self.start = self._axis = None
+                here = derivatives(first.p, first.n, self.start.o, self.start.d, self._axis(first))
+                δp, δn, δo, δd, δaxis = here
+                for leaf, δ, later in zip(self.leaves, (δp, δn, δd, δaxis), self._forward(δo, δd), strict=True):
+                    dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(δ), later))
+                self.at_first = self.start = None
 
     def _start(self, ray: mi.Ray3f) -> None:
         """The first vertex, and what moves the second."""
@@ -283,11 +284,15 @@ class MovingVertex:
         with dr.resume_grad():
             self.start = Start(mi.Point3f(si.p), d, mi.Spectrum(1))
 
-    def _forward(self, δo: mi.Point3f, δd: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
-        """Derivatives of position, normal and direction onwards, where it is not the first."""
+    def _axis(self, si: mi.SurfaceInteraction3f) -> mi.Vector3f:
+        """With what directions turn there, attached."""
+        return axis_of(si) if self._turns else mi.Vector3f(0)
+
+    def _forward(self, δo: mi.Point3f, δd: mi.Vector3f) -> list[mi.Vector3f]:
+        """Derivatives of position, normal, direction onwards, and axis, where it is not the first."""
         chain, log = self.chain, self.log
 
-        def bounce(depth, p, n, o, d):
+        def bounce(depth, p, n, o, d, axis):
             active = self.active & (depth <= self.depth)
             vertex = log.vertex(depth, active)
             x, direction = leaves(vertex.ray.o, vertex.ray.d)
@@ -297,25 +302,26 @@ class MovingVertex:
             si = chain.surface(vertex, x, direction, active)
             with dr.resume_grad():
                 moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
-                found = derivatives(si.p, si.n, moving.o, moving.d)
+                found = derivatives(si.p, si.n, moving.o, moving.d, self._axis(si))
             return depth + 1, *(mi.Vector3f(v) for v in found)
 
         zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
         # A vertex that does not slide knows nothing of those before.
         first, chained = dr.maximum(self.since, 2), self.since == 1
-        _, p, n, _, d = dr.while_loop(
+        _, p, n, _, d, axis = dr.while_loop(
             (
                 first,
                 mi.Vector3f(zero),
                 mi.Vector3f(zero),
                 dr.select(chained, mi.Vector3f(δo), 0),
                 dr.select(chained, mi.Vector3f(δd), 0),
+                mi.Vector3f(zero),
             ),
             lambda depth, *_: self.active & (depth <= self.depth),
             bounce,
             label="motion of a vertex",
         )
-        return p, n, d
+        return [p, n, d, axis]
 
     @property
     def gradients(self) -> list:
@@ -328,7 +334,7 @@ class MovingVertex:
         δp, δn, δd, δaxis = self.gradients
         dr.eval(δp, δn, δd, δaxis)
 
-        def bounce(depth, δp, δn, δd):
+        def bounce(depth, δp, δn, δd, δaxis):
             active = self.active & (depth >= dr.maximum(self.since, 2))
             vertex = log.vertex(depth, active)
             o, d = leaves(vertex.ray.o, vertex.ray.d)
@@ -336,15 +342,16 @@ class MovingVertex:
             with dr.resume_grad():
                 moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
                 value = dr.dot(δp, moving.o) + dr.dot(δn, si.n) + dr.dot(δd, moving.d)
+                value += dr.dot(δaxis, self._axis(si))
                 dr.backward_from(dr.select(active, value, 0), flags=FLAGS)
                 δo, δd = dr.grad(o), dr.grad(d)
-            return depth - 1, mi.Vector3f(δo), mi.Vector3f(0), δd
+            return depth - 1, mi.Vector3f(δo), mi.Vector3f(0), δd, mi.Vector3f(0)
 
         with dr.suspend_grad():
             at_first = self.depth == 1
             later = lambda g: dr.select(at_first, 0, mi.Vector3f(g))
-            _, δo, _, to_first = dr.while_loop(
-                (mi.UInt32(self.depth), later(δp), later(δn), later(δd)),
+            _, δo, _, to_first, _ = dr.while_loop(
+                (mi.UInt32(self.depth), later(δp), later(δn), later(δd), later(δaxis)),
                 lambda depth, *_: self.active & (depth >= dr.maximum(self.since, 2)),
                 bounce,
                 label="motion of a vertex",
@@ -352,7 +359,7 @@ class MovingVertex:
         with dr.resume_grad():
             si, start = self.at_first, self.start
             value = dr.dot(dr.select(at_first, δp, 0), si.p) + dr.dot(dr.select(at_first, δn, 0), si.n)
-            value += dr.dot(dr.select(at_first, δaxis, 0), self._axis)
+            value += dr.dot(dr.select(at_first, δaxis, 0), self._axis(si))
             to_first = dr.select(at_first, mi.Vector3f(δd), to_first)
             chained = self.active & (self._last > 1) & (self.since == 1)
             value += dr.select(chained & ~at_first, dr.dot(δo, start.o), 0)
@@ -394,8 +401,8 @@ class ChosenVertex(MovingVertex):
             return chosen
 
         log, chosen = written(scene, first.ray, 1, depths, follow, lambda chosen: chosen[0].depth)
-        vertex, active, since, self.density = chosen
-        super().__init__(chain, ray, first, log, vertex, active, since, mode, lamps=lamps)
+        vertex, active, since, before, self.density = chosen
+        super().__init__(chain, ray, first, log, vertex, active, since, mode, lamps=lamps, before=before)
 
 
 def written(
