@@ -14,7 +14,6 @@ from rimlight.edge_sampling import (
     Cracks,
     Geometry,
     TextureLines,
-    film_parts,
     jumping_textures,
     maps_in_steps,
     objects_below,
@@ -44,7 +43,8 @@ class Moving:
     """What moves.
 
     known : the shapes that can: meshes, then analytic shapes. flags : do they? camera, lights : do these?
-    mapped : shapes whose normal maps or bump maps change, or the index of whose glass.
+    mapped : shapes whose normal maps or bump maps change, or the index of whose glass, or their texture coordinates.
+    sliding : those whose texture coordinates do.
     """
 
     known: tuple[Any, ...]
@@ -52,10 +52,11 @@ class Moving:
     camera: bool
     lights: bool
     mapped: tuple[Any, ...]
+    sliding: tuple[Any, ...] = ()
 
     @property
     def key(self) -> tuple:
-        return self.flags, self.camera, self.lights, tuple(id(s) for s in self.mapped)
+        return self.flags, self.camera, self.lights, tuple(id(s) for s in (*self.mapped, *self.sliding))
 
     @property
     def anything(self) -> bool:
@@ -212,6 +213,13 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
         limits.append(
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
             f"{', '.join(mapped)} turn away from what they light."
+        )
+    slid = [s for s in moving.sliding if depths.scatters(2) or (s.is_emitter() and depths.scatters(1))]
+    slid = names(s for s in slid if bisects and len(TextureLines([s])))
+    if slid:
+        limits.append(
+            f"the derivative lacks, in the light that {', '.join(slid)} throw on other surfaces, the jumps of their "
+            "textures, whose coordinates change; use bilinear bitmaps."
         )
     stepped = maps_in_steps(moving.with_lines)
     if stepped:
@@ -400,35 +408,3 @@ SHEARED = 1e-3
 
 #: Largest coordinate of a scene, relative to its diagonal, up to which there is no warning.
 DISTANT = 1000
-
-
-def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
-    """What the derivative lacks where the far clipping plane of a sensor cuts through shapes.
-
-    shapes : those that move as seen from the sensor.
-    """
-    limits = []
-    for part in film_parts(sensor):
-        if not hasattr(part.sensor, "far_clip"):
-            continue
-        far, to_local = part.sensor.far_clip(), dr.detach(part.sensor.world_transform()).inverse().matrix
-        axis = np.array([to_local[2, k] for k in range(4)], np.float64).ravel()
-        cut = [s for s in shapes if _crosses(s, axis, far)]
-        if cut:
-            limits.append(
-                f'the derivative lacks the cut of the far clipping plane of "{part.sensor.id()}" through '
-                f"{', '.join(names(cut))}; increase its far_clip, now {far:g}."
-            )
-    return limits
-
-
-def _crosses(shape: mi.Shape, axis: np.ndarray, depth: float) -> bool:
-    """Are there points of a shape on both sides of a plane? axis : (4,), maps points to depths."""
-    box = shape.bbox()
-    bounds = np.stack([np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()])
-    corners = np.stack(np.meshgrid(*bounds.T), -1).reshape(-1, 3)
-    sides = corners @ axis[:3] + axis[3] > depth
-    if sides.all() or not sides.any() or not shape.is_mesh():
-        return bool(sides.any() and not sides.all())
-    sides = vertices(shape).astype(np.float64) @ axis[:3] + axis[3] > depth
-    return bool(sides.any() and not sides.all())

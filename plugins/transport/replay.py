@@ -265,10 +265,11 @@ class MovingVertex:
             if mode == dr.ADMode.Forward:
                 first = self.at_first
                 δp, δn, δo, δd, δaxis = derivatives(first.p, first.n, self.start.o, self.start.d, self._axis)
+                # Not to be kept: Dr.Jit 1.5 refuses to pass it by in the loop.
+                self.at_first = self.start = self._axis = first = turning = None
                 moved = *self._forward(δo, δd), mi.Vector3f(0)
                 for leaf, here, later in zip(self.leaves, (δp, δn, δd, δaxis), moved, strict=True):
                     dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(here), later))
-                self.at_first = self.start = self._axis = None
 
     def _start(self, ray: mi.Ray3f) -> None:
         """The first vertex, and what moves the second."""
@@ -297,7 +298,8 @@ class MovingVertex:
             si = chain.surface(vertex, x, direction, active)
             with dr.resume_grad():
                 moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
-                found = derivatives(si.p, si.n, moving.o, moving.d)
+                # With all that parameters of the mesh change: Dr.Jit 1.5 refuses to leave any of it out.
+                found = derivatives(si.p, si.n, moving.o, moving.d, si.uv, si.sh_frame.n)[:4]
             return depth + 1, *(mi.Vector3f(v) for v in found)
 
         zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))
