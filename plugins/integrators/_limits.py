@@ -45,6 +45,7 @@ class Moving:
     known : the shapes that can: meshes, then analytic shapes. flags : do they? camera, lights : do these?
     mapped : shapes whose normal maps or bump maps change, or the index of whose glass, or their texture coordinates.
     sliding : those whose texture coordinates do.
+    turning : does a mesh have vertex normals that change? Those that move do not count.
     """
 
     known: tuple[Any, ...]
@@ -53,13 +54,19 @@ class Moving:
     lights: bool
     mapped: tuple[Any, ...]
     sliding: tuple[Any, ...] = ()
+    turning: tuple[bool, ...] = ()
 
     @property
     def key(self) -> tuple:
-        return self.flags, self.camera, self.lights, tuple(id(s) for s in (*self.mapped, *self.sliding))
+        return self.flags, self.turning, self.camera, self.lights, tuple(id(s) for s in (*self.mapped, *self.sliding))
 
     @property
     def anything(self) -> bool:
+        return self.in_space or any(self.turning)
+
+    @property
+    def in_space(self) -> bool:
+        """Does anything but the normals of meshes change that moves edges, as some point of a path sees them?"""
         return self.camera or self.lights or any(self.flags) or bool(self.mapped)
 
     @property

@@ -40,7 +40,7 @@ from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
-from rimlight.edge_sampling.geometry.meshes import inner, surfaces, texture_slides
+from rimlight.edge_sampling.geometry.meshes import inner, normals_turn, surfaces, texture_slides
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
@@ -197,7 +197,8 @@ class BoundarySearch:
         turned = (*((m.shape, m) for m in self._maps), *self._bent)
         mapped = [shape for shape, what in turned if what.turns]
         sliding = tuple(dict.fromkeys(inner(m) for m in geometry.meshes if texture_slides(m)))
-        return Moving(shapes, moves, camera, lights, tuple(dict.fromkeys((*mapped, *sliding))), sliding)
+        turning = tuple(self.from_points and not moves[i] and normals_turn(m) for i, m in enumerate(geometry.meshes))
+        return Moving(shapes, moves, camera, lights, tuple(dict.fromkeys((*mapped, *sliding))), sliding, turning)
 
     # ---------------------- Boundaries ----------------------
 
@@ -224,7 +225,10 @@ class BoundarySearch:
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
         soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
         edges = self._edges_and_lines
-        film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft) if on_film.any() else None
+        turning, sppi = np.array(moving.turning, bool), sppi if moving.in_space else 0
+        film = None
+        if on_film.any() or turning.any():
+            film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft, turning=turning)
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi)
