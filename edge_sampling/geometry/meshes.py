@@ -166,16 +166,6 @@ def is_moving(mesh: Any) -> bool:
     return dr.grad_enabled(mesh.vertex_positions_buffer() if hasattr(mesh, OLD) else mesh.positions())
 
 
-def texture_slides(mesh: Any) -> bool:
-    """Do the texture coordinates carry a gradient?"""
-    return has_texcoords(mesh) and dr.grad_enabled(texcoords_of(mesh))
-
-
-def normals_turn(mesh: Any) -> bool:
-    """Do the interpolated normals carry a gradient?"""
-    return isinstance(mesh, mi.Mesh) and has_interpolated_normals(mesh) and dr.grad_enabled(normals_of(mesh))
-
-
 def is_positions_key(key: str) -> bool:
     """Does a parameter of a scene hold the positions of a mesh? ``vertex_positions``, (3 V,), or since Mitsuba 3.10
     ``positions``, (P, 3)."""

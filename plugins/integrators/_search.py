@@ -39,8 +39,9 @@ from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
+from rimlight.edge_sampling.geometry.interpolated import normals_turn, texture_slides
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
-from rimlight.edge_sampling.geometry.meshes import inner, normals_turn, surfaces, texture_slides
+from rimlight.edge_sampling.geometry.meshes import inner, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.parametrisation import slides_behind_glass
