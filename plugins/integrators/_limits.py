@@ -20,7 +20,7 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
-from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
+from rimlight.edge_sampling.geometry.meshes import faces, has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_others
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP
 from rimlight.edge_sampling.rays import extent
@@ -273,6 +273,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
             f"such nor meshes: {pairs}. Replace them by meshes."
         )
+    doubled = names(s for s in moving.on_film if isinstance(s, mi.Mesh) and has_open_sliver(s))
+    if doubled:
+        limits.append(
+            f"the derivative may count part of the open borders of {', '.join(doubled)} twice, where faces without "
+            "area lie along them. Remove these faces."
+        )
     closed = {
         tuple(geometry.meshes[i].id() for i in pair): width
         for pair, width in cracks.widest().items()
@@ -285,6 +291,25 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"units wide: {pairs}. Join the vertices there, or move them farther apart."
         )
     return limits
+
+
+def has_open_sliver(mesh: mi.Mesh) -> bool:
+    """Does a face that has no area, but different corners, lie along the open border of a mesh?"""
+    p, corners = vertices(mesh).astype(np.float64), faces(mesh)
+    sides = p[np.roll(corners, -1, 1)] - p[corners]
+    squared = np.square(sides).sum(2)
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    thin = (area <= SLIVER * squared.max(1)) & (squared.min(1) > 0)
+    if not thin.any():
+        return False
+    place = np.unique(p, axis=0, return_inverse=True)[1].ravel()
+    ends = np.sort(place[np.stack([corners, np.roll(corners, -1, 1)], 2)], 2).reshape(-1, 2)
+    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    return bool((count[edge.ravel()].reshape(-1, 3)[thin] == 1).any())
+
+
+#: Height of a triangle, relative to its longest side, up to which it has no area.
+SLIVER = 1e-6
 
 
 def has_its_inverse(shape: Any) -> bool:

@@ -321,3 +321,17 @@ def test_textures_that_slide_in_indirect_light(kind, options, missing):
     messages = said(as_written.checkered_board(), "board.vertex_texcoords", kind=kind, **options)
     assert len(messages) == missing
     assert all('in the light that "board" throw on other surfaces, the jumps of their textures' in m for m in messages)
+
+
+# ---------------------- Faces without area ----------------------
+
+
+@pytest.mark.parametrize("beyond", [False, True])
+def test_faces_without_area_along_open_borders(beyond):
+    """Such a face is no border where there are others beyond it."""
+    corners = [*as_written.CORNERS, [0, 0.9, 0.15], [0, 2, 0.15]]
+    faces = [[0, 2, 1], [1, 2, 3], [2, 4, 3], *([[2, 5, 4], [4, 5, 3]] if beyond else [])]
+    board = cases.mesh("board", corners, faces, bsdf=cases.diffuse(0.5, two_sided=True))
+    messages = said(cases.scene(sensor=cases.camera(), board=board, sky=cases.constant()), "board.vertex_positions")
+    assert len(messages) == (not beyond)
+    assert all('open borders of "board" twice' in message for message in messages)
