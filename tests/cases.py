@@ -13,6 +13,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from as_written import AS_WRITTEN
 from beams import BEAMS
 from building import (
     CUBE_FACES,
@@ -925,6 +926,7 @@ CASES = [
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k.endswith("_slides") else 1024)
         for k, (*of, depth) in (INSTANCES | CURVES | JOINTS).items()
     ),
+    *(Case(k, *of, spp=64, runs=12, integrator=kind, reference_spp=4096) for k, (*of, kind) in AS_WRITTEN.items()),
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
         for k, of in HIDDEN.items()

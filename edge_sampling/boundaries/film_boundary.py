@@ -85,6 +85,7 @@ class FilmBoundary:
     geometry : the shapes.
     edges : of their meshes, on the host.
     moving : see `Geometry.moving`; which of them can move over the film.
+    turning : of the meshes, which have vertex normals that change.
     lights : of the scene.
     soft : are there lights with a size, or light that is scattered? Then a part of it may lie behind one face of a
         smooth-shaded mesh, but not behind the next, and what is seen jumps at the edge (see `face_planes.py`).
@@ -101,11 +102,12 @@ class FilmBoundary:
         lights: Lights,
         *,
         soft: bool,
+        turning: np.ndarray | bool = False,
         seams: bool = False,
     ):
         self.lights = lights
         self.veils = any(lets_rays_through(s) for s in (*geometry.meshes, *geometry.analytic, *geometry.others))
-        self.outlines = FilmOutlines(geometry, edges, moving, soft=soft, seams=seams)
+        self.outlines = FilmOutlines(geometry, edges, moving, turning, soft=soft, seams=seams)
 
     @property
     def edge_count(self) -> int:

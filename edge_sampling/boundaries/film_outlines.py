@@ -86,13 +86,22 @@ class FilmOutlines:
 
     Parameters
     ----------
-    geometry, edges, moving, soft, seams : see `FilmBoundary`.
+    geometry, edges, moving, turning, soft, seams : see `FilmBoundary`.
     """
 
     _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "lines")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool, seams: bool):
+    def __init__(
+        self,
+        geometry: Geometry,
+        edges: Edges,
+        moving: np.ndarray,
+        turning: np.ndarray | bool,
+        *,
+        soft: bool,
+        seams: bool,
+    ):
         self.geometry, self.soft = geometry, soft
         self.lines = geometry.lines
         edges, faces = edges.of_meshes(moving, lines=geometry.any_line(moving)), geometry.faces(moving)
@@ -109,7 +118,7 @@ class FilmOutlines:
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
         self.curves = Curves.of(geometry, moving[len(geometry.meshes) :], seams=seams)
-        horizons = Horizons(geometry, moving[: len(geometry.meshes)])
+        horizons = Horizons(geometry, moving[: len(geometry.meshes)] | turning)
         self.horizons = horizons if len(horizons) else None
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
         cuts = len(faces) if len(edges) else 0

@@ -65,7 +65,7 @@ class Motion:
 
         self.initial = type(value)(dr.detach(value))
         geometric = self.is_positions or self.is_transform
-        size = 3 if geometric else dr.prod(value.shape) if self.is_tensor else dr.size_v(value) * dr.width(value)
+        size = 3 if geometric else dr.prod(dr.shape(value))
         self.direction = (
             None if direction is None else _numbers(key, "direction", direction, {size} if geometric else {1, size})
         )

@@ -14,14 +14,13 @@ from rimlight.edge_sampling import (
     Cracks,
     Geometry,
     TextureLines,
-    film_parts,
     jumping_textures,
     maps_in_steps,
     objects_below,
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
-from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
+from rimlight.edge_sampling.geometry.meshes import faces, has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_others
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP
 from rimlight.edge_sampling.rays import extent
@@ -44,7 +43,9 @@ class Moving:
     """What moves.
 
     known : the shapes that can: meshes, then analytic shapes. flags : do they? camera, lights : do these?
-    mapped : shapes whose normal maps or bump maps change, or the index of whose glass.
+    mapped : shapes whose normal maps or bump maps change, or the index of whose glass, or their texture coordinates.
+    sliding : those whose texture coordinates do.
+    turning : does a mesh have vertex normals that change? Those that move do not count.
     """
 
     known: tuple[Any, ...]
@@ -52,13 +53,20 @@ class Moving:
     camera: bool
     lights: bool
     mapped: tuple[Any, ...]
+    sliding: tuple[Any, ...] = ()
+    turning: tuple[bool, ...] = ()
 
     @property
     def key(self) -> tuple:
-        return self.flags, self.camera, self.lights, tuple(id(s) for s in self.mapped)
+        return self.flags, self.turning, self.camera, self.lights, tuple(id(s) for s in (*self.mapped, *self.sliding))
 
     @property
     def anything(self) -> bool:
+        return self.in_space or any(self.turning)
+
+    @property
+    def in_space(self) -> bool:
+        """Does anything but the normals of meshes change that moves edges, as some point of a path sees them?"""
         return self.camera or self.lights or any(self.flags) or bool(self.mapped)
 
     @property
@@ -213,6 +221,13 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
             f"{', '.join(mapped)} turn away from what they light."
         )
+    slid = [s for s in moving.sliding if depths.scatters(2) or (s.is_emitter() and depths.scatters(1))]
+    slid = names(s for s in slid if bisects and len(TextureLines([s])))
+    if slid:
+        limits.append(
+            f"the derivative lacks, in the light that {', '.join(slid)} throw on other surfaces, the jumps of their "
+            "textures, whose coordinates change; use bilinear bitmaps."
+        )
     stepped = maps_in_steps(moving.with_lines)
     if stepped:
         limits.append(
@@ -258,6 +273,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
             f"such nor meshes: {pairs}. Replace them by meshes."
         )
+    doubled = names(s for s in moving.on_film if isinstance(s, mi.Mesh) and has_open_sliver(s))
+    if doubled:
+        limits.append(
+            f"the derivative may count part of the open borders of {', '.join(doubled)} twice, where faces without "
+            "area lie along them. Remove these faces."
+        )
     closed = {
         tuple(geometry.meshes[i].id() for i in pair): width
         for pair, width in cracks.widest().items()
@@ -270,6 +291,25 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"units wide: {pairs}. Join the vertices there, or move them farther apart."
         )
     return limits
+
+
+def has_open_sliver(mesh: mi.Mesh) -> bool:
+    """Does a face that has no area, but different corners, lie along the open border of a mesh?"""
+    p, corners = vertices(mesh).astype(np.float64), faces(mesh)
+    sides = p[np.roll(corners, -1, 1)] - p[corners]
+    squared = np.square(sides).sum(2)
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    thin = (area <= SLIVER * squared.max(1)) & (squared.min(1) > 0)
+    if not thin.any():
+        return False
+    place = np.unique(p, axis=0, return_inverse=True)[1].ravel()
+    ends = np.sort(place[np.stack([corners, np.roll(corners, -1, 1)], 2)], 2).reshape(-1, 2)
+    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    return bool((count[edge.ravel()].reshape(-1, 3)[thin] == 1).any())
+
+
+#: Height of a triangle, relative to its longest side, up to which it has no area.
+SLIVER = 1e-6
 
 
 def has_its_inverse(shape: Any) -> bool:
@@ -400,35 +440,3 @@ SHEARED = 1e-3
 
 #: Largest coordinate of a scene, relative to its diagonal, up to which there is no warning.
 DISTANT = 1000
-
-
-def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
-    """What the derivative lacks where the far clipping plane of a sensor cuts through shapes.
-
-    shapes : those that move as seen from the sensor.
-    """
-    limits = []
-    for part in film_parts(sensor):
-        if not hasattr(part.sensor, "far_clip"):
-            continue
-        far, to_local = part.sensor.far_clip(), dr.detach(part.sensor.world_transform()).inverse().matrix
-        axis = np.array([to_local[2, k] for k in range(4)], np.float64).ravel()
-        cut = [s for s in shapes if _crosses(s, axis, far)]
-        if cut:
-            limits.append(
-                f'the derivative lacks the cut of the far clipping plane of "{part.sensor.id()}" through '
-                f"{', '.join(names(cut))}; increase its far_clip, now {far:g}."
-            )
-    return limits
-
-
-def _crosses(shape: mi.Shape, axis: np.ndarray, depth: float) -> bool:
-    """Are there points of a shape on both sides of a plane? axis : (4,), maps points to depths."""
-    box = shape.bbox()
-    bounds = np.stack([np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()])
-    corners = np.stack(np.meshgrid(*bounds.T), -1).reshape(-1, 3)
-    sides = corners @ axis[:3] + axis[3] > depth
-    if sides.all() or not sides.any() or not shape.is_mesh():
-        return bool(sides.any() and not sides.all())
-    sides = vertices(shape).astype(np.float64) @ axis[:3] + axis[3] > depth
-    return bool(sides.any() and not sides.all())

@@ -39,6 +39,7 @@ from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
+from rimlight.edge_sampling.geometry.interpolated import normals_turn, texture_slides
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
 from rimlight.edge_sampling.geometry.meshes import inner, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
@@ -47,7 +48,8 @@ from rimlight.edge_sampling.parametrisation import slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
-from ._limits import Media, Moving, PartialParameters, beyond_far_plane, is_mirror, lasting_limits, refuse_timed_sky
+from ._clipping import cut_by_clipping_planes
+from ._limits import Media, Moving, PartialParameters, is_mirror, lasting_limits, refuse_timed_sky
 
 #: Parameters of a light that move the shadows in it, or the border of its beam.
 PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction", "cutoff_angle")
@@ -194,8 +196,10 @@ class BoundarySearch:
         others = [mi.traverse(e) for e in others]
         lights = lamps or any(dr.grad_enabled(p[k]) for p in others for k in PLACE_OF_LIGHT if k in p)
         turned = (*((m.shape, m) for m in self._maps), *self._bent)
-        mapped = tuple(dict.fromkeys(shape for shape, what in turned if what.turns))
-        return Moving(shapes, moves, camera, lights, mapped)
+        mapped = [shape for shape, what in turned if what.turns]
+        sliding = tuple(dict.fromkeys(inner(m) for m in geometry.meshes if texture_slides(m)))
+        turning = tuple(self.from_points and not moves[i] and normals_turn(m) for i, m in enumerate(geometry.meshes))
+        return Moving(shapes, moves, camera, lights, tuple(dict.fromkeys((*mapped, *sliding))), sliding, turning)
 
     # ---------------------- Boundaries ----------------------
 
@@ -222,7 +226,10 @@ class BoundarySearch:
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
         soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
         edges = self._edges_and_lines
-        film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft) if on_film.any() else None
+        turning, sppi = np.array(moving.turning, bool), sppi if moving.in_space else 0
+        film = None
+        if on_film.any() or turning.any():
+            film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft, turning=turning)
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi)
@@ -303,5 +310,5 @@ class BoundarySearch:
         key = (id(sensor), moving.flags, moving.camera)
         if key not in self._beyond and not dr.flag(dr.JitFlag.FreezingScope):
             # With the sensor, so that its number is given to no other one.
-            self._beyond[key] = sensor, beyond_far_plane(sensor, list(moving.on_film))
+            self._beyond[key] = sensor, cut_by_clipping_planes(sensor, list(moving.on_film))
         return self._beyond[key][1] if key in self._beyond else []

@@ -267,9 +267,10 @@ class MovingVertex:
                 first = self.at_first
                 here = derivatives(first.p, first.n, self.start.o, self.start.d, self._axis(first))
                 δp, δn, δo, δd, δaxis = here
+                # Not to be kept: Dr.Jit 1.5 refuses to pass it by in the loop.
+                self.at_first = self.start = first = None
                 for leaf, δ, later in zip(self.leaves, (δp, δn, δd, δaxis), self._forward(δo, δd), strict=True):
                     dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(δ), later))
-                self.at_first = self.start = None
 
     def _start(self, ray: mi.Ray3f) -> None:
         """The first vertex, and what moves the second."""
@@ -302,7 +303,9 @@ class MovingVertex:
             si = chain.surface(vertex, x, direction, active)
             with dr.resume_grad():
                 moving = chain.along(log, depth, si, vertex, active & (depth < self._last))
-                found = derivatives(si.p, si.n, moving.o, moving.d, self._axis(si))
+                # With all that parameters of the mesh change: Dr.Jit 1.5 refuses to leave any of it out.
+                follow = si.p, si.n, moving.o, moving.d, self._axis(si), si.uv, si.sh_frame.n
+                found = derivatives(*follow)[:5]
             return depth + 1, *(mi.Vector3f(v) for v in found)
 
         zero = mi.Vector3f(dr.zeros(mi.Float, dr.width(self.depth)))

@@ -59,7 +59,6 @@ class PathTracer:
         self.scene = scene
         self.depths: Depths = integrator.depths
         self.hide_emitters: bool = integrator.hide_emitters
-        self._skip_area_emitters = integrator.skip_area_emitters
 
     def scatters(self, depth: mi.UInt32 | int) -> mi.Bool | bool:
         """May a vertex of this number reflect direct light?"""
@@ -132,12 +131,26 @@ class PathTracer:
     def first_hit(self, ray: mi.Ray3f, active: mi.Bool | bool) -> mi.PreliminaryIntersection3f:
         """What camera rays meet."""
         pi = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        if self.hide_emitters:
-            skip = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array of pointers)
-            at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
+        return self._behind_emitters(ray, pi, pi.is_valid() & active) if self.hide_emitters else pi
+
+    def _behind_emitters(
+        self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+    ) -> mi.PreliminaryIntersection3f:
+        """What camera rays meet that pass through emitters, on their own line: Mitsuba's `skip_area_emitters` leaves it
+        by more than the rays beside an edge are apart, and counts the distance from the last emitter."""
+
+        def step(pi, going):
+            at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, going)
             onwards = spawn_ray(self.scene, at, ray.d, True)
-            pi[skip] = self._skip_area_emitters(self.scene, onwards, True, skip)
-        return pi
+            gone = dr.dot(onwards.o - ray.o, ray.d)
+            onwards.maxt = ray.maxt - gone
+            beyond = self.scene.ray_intersect_preliminary(onwards, coherent=True, active=going)
+            beyond.t += gone
+            pi = dr.select(going, beyond, pi)
+            return pi, going & emits(pi)
+
+        emits = lambda pi: pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array of pointers)
+        return dr.while_loop((pi, active & emits(pi)), lambda pi, going: going, step, label="hidden emitters")[0]
 
     def seen(
         self,

@@ -50,14 +50,17 @@ def main(names: list[str]) -> None:
             continue
         start = time.time()
         scene = (c.reference_scene or c.scene)()
+        # Without Russian roulette: its random choices would differ between the images of a run.
+        images = {"type": c.reference_images, "max_depth": c.max_depth, "rr_depth": 1000}
+        if "hide_emitters" in c.integrator:
+            images["hide_emitters"] = c.integrator["hide_emitters"]
         reference = finite_differences(
             scene,
             Motion(scene, **c.motion),
             step=c.step,
             runs=c.runs,
             spp=c.reference_spp,
-            # Without Russian roulette: its random choices would differ between the images of a run.
-            integrator=mi.load_dict({"type": c.reference_images, "max_depth": c.max_depth, "rr_depth": 1000}),
+            integrator=mi.load_dict(images),
             progress=True,
         )
         command = f"python tests/references/make.py {c.name}"

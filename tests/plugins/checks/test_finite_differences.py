@@ -7,6 +7,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+from building import mesh
 
 from rimlight.checks import FiniteDifferences, Motion, finite_differences, two_sides
 
@@ -70,3 +71,11 @@ def test_sides_that_cancel_are_apart():
     apart, noise = two_sides(down, up)
     assert apart == 2 and noise < 0.2
     assert two_sides(up, up)[0] == 0
+
+
+def test_a_direction_has_a_number_for_each_element_of_an_array():
+    corners, coordinates = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
+    it = mi.load_dict({"type": "scene", "card": mesh("card", corners, [[0, 1, 2]], uv=coordinates)})
+    motion = Motion(it, "card.vertex_texcoords", direction=range(6))
+    motion.apply(2.0)
+    assert np.allclose(np.array(motion.params["card.vertex_texcoords"]), np.ravel(coordinates) + 2 * np.arange(6))
