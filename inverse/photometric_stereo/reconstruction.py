@@ -24,7 +24,7 @@ from rimlight.edge_sampling.refusals import InputError
 
 from . import least_squares, plausibility, start, taking_back
 from .alternation import Alternations, Course, State, View
-from .dataset import Dataset, angles
+from .dataset import Dataset
 from .direct import Guess
 from .evidence import Judge, Kind, left_out
 from .progress import Checkpoint, Progress
@@ -174,8 +174,8 @@ class Result:
 
     @property
     def error(self) -> float | None:
-        """Mean angular error, degrees."""
-        return None if self.data.truth is None else float(angles(self.guess.normals, self.data.truth).mean())
+        """Mean angular error, degrees, of the pixels whose true normals are known."""
+        return None if self.data.truth is None else float(np.nanmean(self.data.off(self.guess.normals)))
 
 
 def reconstruct(
@@ -323,7 +323,7 @@ class Reconstruction:
         size = self.options.resolutions[min(now.level, len(self.options.resolutions) - 1)]
         entry = {"size": size, "seconds": now.seconds, "residual": residual}
         if level.truth is not None:
-            entry["error"] = float(angles(normals, level.truth).mean())
+            entry["error"] = float(np.nanmean(level.off(normals)))
         now.history.append(entry)
         self.bar.set_postfix({k: f"{v:.3g}" for k, v in entry.items() if k != "seconds"})
         self.bar.update()

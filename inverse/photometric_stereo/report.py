@@ -21,7 +21,7 @@ from rimlight.inverse.page import number
 from rimlight.sys_info import processor
 
 from . import least_squares, output
-from .dataset import LUMINANCE, Dataset, angles, unit
+from .dataset import LUMINANCE, Dataset, unit
 from .direct import Guess
 from .integration import normals_of
 from .reconstruction import Options, Result
@@ -140,7 +140,7 @@ def _verdict(view: View, result: Result, status: str) -> str:
     if result.error is not None:
         facts.append(f"mean angular error {result.error:.2f}°")
         if view.start is not None:
-            facts[-1] += f" (least squares: {angles(view.start, view.data.truth).mean():.2f}°)"
+            facts[-1] += f" (least squares: {np.nanmean(view.data.off(view.start)):.2f}°)"
     facts.append(f"residual {number(100 * result.history[-1]['residual'], 2)} % of the median value")
     facts += output.judgement(result)
     kind = "status" if status == "finished" else "status bad"
@@ -158,7 +158,7 @@ def _shape(view: View, result: Result, truth: np.ndarray | None) -> str:
     figures = [_figure(_coloured_normals(view.image(n, np.nan)), f"Normals: {name}") for name, n in maps.items()]
     sections = [f'<section>\n<h2>Shape</h2>\n<div class="maps">{"".join(figures)}</div>']
     if data.truth is not None:
-        errors = {name: angles(n, data.truth) for name, n in maps.items() if name != "truth"}
+        errors = {name: data.off(n) for name, n in maps.items() if name != "truth"}
         sections.append(_with_scale({f"Error: {name}": e for name, e in errors.items()}, view.image, "degrees"))
     depth = view.image(view.depth, np.nan)
     inside = np.isfinite(depth)
@@ -317,11 +317,11 @@ def _coloured(values: np.ndarray, name: str, low: float | None = None, high: flo
 
 
 def _with_scale(maps: dict[str, np.ndarray], image: Callable, unit: str) -> str:
-    """Maps of positive numbers, (P,), with one scale."""
-    limit = max(float(np.percentile(np.concatenate(list(maps.values())), 98)), 1e-6)
+    """Maps of positive numbers, (P,), with one scale. NaN where they are not known."""
+    limit = max(float(np.nanpercentile(np.concatenate(list(maps.values())), 98)), 1e-6)
     figures = []
     for name, values in maps.items():
-        caption = f"{name}, mean {number(float(values.mean()))}"
+        caption = f"{name}, mean {number(float(np.nanmean(values)))}"
         figures.append(_figure(_coloured(image(values, np.nan), "inferno", 0, limit), caption))
     return f'<div class="maps">{"".join(figures)}</div>\n{_scale("inferno", 0, limit, unit)}'
 
