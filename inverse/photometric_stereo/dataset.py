@@ -35,7 +35,7 @@ from .files import (
     read_truth,
 )
 from .integration import check_camera, ray_matrix
-from .vectors import LUMINANCE, directions_of, every, unit
+from .vectors import LUMINANCE, directions_of, every
 
 log = logging.getLogger(__name__)
 
@@ -181,6 +181,15 @@ class Dataset:
         truth = None if self.truth is None else directions_of(mean(self.truth))
         truth = truth if truth is not None and truth.any() else None
         return replace(self, values=mean(self.values).astype(np.float32), mask=mask, camera=camera, truth=truth)
+
+    def without(self, numbers: Sequence[int]) -> Dataset:
+        """The data set without some of its images."""
+        kept = [k for k in range(len(self.lights)) if k not in numbers]
+        lights = tuple(self.lights[k] for k in kept) if self.near else self.lights[kept]
+        names = tuple(self.names[k] for k in kept) if self.names else ()
+        return replace(
+            self, values=self.values[:, kept], lights=lights, intensities=self.intensities[kept], names=names
+        )
 
     def blocks(self, step: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
         """Coarse pixels, of step x step of these: their mask, where at least half of a block is in the mask; and what

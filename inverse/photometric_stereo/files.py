@@ -217,5 +217,7 @@ def read_truth(folder: Path, mask: np.ndarray) -> np.ndarray | None:
         raise InputError(f"ps: {path.name} holds no normals of the size of the mask")
     found = directions_of(normals[mask].astype(np.float64))
     if missing := int((~found.any(1)).sum()):
-        log.warning("ps: %s has no normals of %d pixels of the mask; errors are those of the others", path.name, missing)
+        log.warning(
+            "ps: %s has no normals of %d pixels of the mask; errors are those of the others", path.name, missing
+        )
     return found if found.any() else None

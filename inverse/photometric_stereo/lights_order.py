@@ -102,7 +102,7 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     lit = np.arange(len(lights)) if lit is None else lit
     if len(lit) < FEWEST:
         return Order(names)
-    C, rng = _products(values[:, lit]), np.random.default_rng(0)
+    C, rng = products(values[:, lit]), np.random.default_rng(0)
     if C is None:
         return Order(names)
     *_, third, second, first = np.linalg.eigvalsh(C)
@@ -132,7 +132,7 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     )
 
 
-def _products(values: np.ndarray) -> np.ndarray | None:
+def products(values: np.ndarray) -> np.ndarray | None:
     """Mean products of the images, (K, K), of trace 1; None if all pixels are black in most images. All pixels count
     alike, and highlights little."""
     v = values / np.maximum(values.mean(1, keepdims=True), 1e-12 * max(values.max(), 1e-30))

@@ -219,12 +219,11 @@ class Reconstruction:
         if not mi.is_rgb or mi.is_polarized:
             raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
-        self.doubts = data.doubts + plausibility.check(data)
-        self.data, self.options, self.after = data, options, after
+        self.data, self.options, self.after = plausibility.checked(data), options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
         self.rng = np.random.default_rng(options.seed)
-        self.scale = start.scale(data.at(options.resolutions[0]), options)
+        self.scale = start.scale(self.data.at(options.resolutions[0]), options)
         self.now = Progress(kind=self.kinds[0])
         self.file: Checkpoint | None = None
         self.work: Alternations | None = None
@@ -347,7 +346,7 @@ class Reconstruction:
             curl={"start": now.start.curl, "result": best.curl},
             taken_back=1.0 if best.start else now.back,
             strength=best.strength,
-            doubts=self.doubts,
+            doubts=self.data.doubts,
             history=now.history,
             seconds=now.seconds,
         )

@@ -21,11 +21,12 @@ from rimlight.inverse.page import number
 from rimlight.sys_info import processor
 
 from . import least_squares, output
-from .dataset import LUMINANCE, Dataset, unit
+from .dataset import LUMINANCE, Dataset
 from .direct import Guess
 from .integration import normals_of
 from .reconstruction import Options, Result
 from .rendering import Rendering
+from .vectors import unit
 
 #: Largest width and height of pictures in the page, pixels.
 SHOWN = 240

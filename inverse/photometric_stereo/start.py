@@ -13,9 +13,10 @@ from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
 from . import calibration, least_squares
-from .dataset import ALL_BLACK, Dataset, unit
+from .dataset import ALL_BLACK, Dataset
 from .direct import DirectModel, Guess
 from .rendering import Domain, unlit
+from .vectors import unit
 
 if TYPE_CHECKING:
     from .reconstruction import Options

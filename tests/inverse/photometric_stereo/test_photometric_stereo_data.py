@@ -20,9 +20,10 @@ from rimlight.cli import main
 from rimlight.exr import write_exr
 from rimlight.inverse.photometric_stereo import calibration, dataset, least_squares
 from rimlight.inverse.photometric_stereo.calibration import Ball
-from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import DirectModel, Guess
 from rimlight.inverse.photometric_stereo.simulation import spiral
+from rimlight.inverse.photometric_stereo.vectors import unit
 from rimlight.leds import Led
 
 # ------------------------------------------------------------------ data sets
