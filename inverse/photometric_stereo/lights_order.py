@@ -23,6 +23,10 @@ CAPPED = 0.8
 #: surface: else the images do not tell the order of their lights, such as those of chrome, nearly all of it black.
 TOLD = 0.2
 
+#: And normals must differ: if they change the squared values by less than this part, as those of a flat painting, then
+#: lights of other exposures, or near ones, look like lights in other directions.
+FLAT = 0.005
+
 #: Random orders with which the given one is compared, and the largest part of them that may explain values as well.
 ORDERS, CHANCE = 300, 0.05
 
@@ -106,7 +110,7 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     if C is None:
         return Order(names)
     *_, third, second, first = np.linalg.eigvalsh(C)
-    if second + third < TOLD * (1 - first):
+    if second + third < max(TOLD * (1 - first), FLAT):
         return Order(names)
     projector = lambda order: _projector(lights[order[lit]])
     A = projector(np.arange(len(lights)))

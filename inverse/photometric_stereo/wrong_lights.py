@@ -25,6 +25,10 @@ BETTER, FARTHER = 3.0, 3.0
 #: Lights whose directions are less wrong do little harm, degrees.
 LEAST = 5.0
 
+#: Images of shallow things hardly depend on the directions of their lights, and so whatever else changes them looks
+#: like another direction. The mean square of normals along the axis where it is smallest must be this part of the largest.
+SHALLOW = 0.03
+
 #: Of the images, at most this part is taken for wrong: of more, it would not be known which ones are right.
 MOST = 0.2
 
@@ -60,8 +64,11 @@ def judged(products: np.ndarray, lights: np.ndarray) -> list[Wrong]:
         found.append(worst)
     if not found:
         return []
-    told = np.linalg.matrix_rank(lights[kept], tol=least_squares.PLANE * len(lights)) == 3
-    return sorted(found, key=lambda w: w.number) if len(found) <= MOST * len(lights) and told else []
+    in_space = np.linalg.matrix_rank(lights[kept], tol=least_squares.PLANE * len(lights)) == 3
+    P = np.linalg.pinv(lights[kept])
+    least, _, largest = np.linalg.eigvalsh(P @ products[np.ix_(kept, kept)] @ P.T)
+    told = in_space and least > SHALLOW * largest and len(found) <= MOST * len(lights)
+    return sorted(found, key=lambda w: w.number) if told else []
 
 
 def _shown(products: np.ndarray, lights: np.ndarray, k: int, others: np.ndarray) -> Wrong:

@@ -258,6 +258,25 @@ def test_inspection_of_large_photographs(shared) -> None:
     assert found.order.chance == 0
 
 
+def test_flat_paintings_tell_nothing_of_their_lights() -> None:
+    """With a relief of up to 6 degrees. Other exposures, noise, and lights that are near and so brighter on their side,
+    looked like another order, swapped lights, or lights in wrong directions."""
+    judged = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        lights = rng.permutation(simulation.spiral(int(rng.choice([6, 8, 10, 16, 24, 40])), rng.uniform(25, 70)))
+        relief = rng.choice([0, 0.01, 0.05, 0.1]) * rng.standard_normal((1500, 2))
+        values = np.maximum(unit(np.c_[relief, np.ones(1500)]) @ lights.T, 0) * rng.uniform(0.1, 0.9, (1500, 1))
+        values *= np.exp(rng.choice([0, 0.05]) * rng.standard_normal(len(lights)))
+        values *= 1 + rng.choice([0, 0.1]) * (rng.uniform(-1, 1, (1500, 2)) @ lights[:, :2].T)
+        values += rng.choice([0, 0.01]) * values.mean() * rng.standard_normal(values.shape)
+        order = lights_order.judged(values, lights, [str(k) for k in range(len(lights))])
+        assert order.known, (seed, order)
+        judged += np.isfinite(order.chance)
+        assert wrong_lights.judged(lights_order.products(values), lights) == [], seed
+    assert judged < 20
+
+
 # ------------------------------------------------------------------ single wrong lights
 
 
