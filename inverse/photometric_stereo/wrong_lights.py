@@ -26,7 +26,8 @@ BETTER, FARTHER = 3.0, 3.0
 LEAST = 5.0
 
 #: Images of shallow things hardly depend on the directions of their lights, and so whatever else changes them looks
-#: like another direction. The mean square of normals along the axis where it is smallest must be this part of the largest.
+#: like another direction. The mean square of normals along the axis where it is smallest must be this part of the
+#: largest.
 SHALLOW = 0.03
 
 #: Of the images, at most this part is taken for wrong: of more, it would not be known which ones are right.
