@@ -68,8 +68,8 @@ for (const relit of document.querySelectorAll(".relit")) {
 class View:
     """A result at the size of the page, with a few of its images only: `data` and `guess` have K' of these.
 
-    depth : (P',), as of `integrate`. chosen : (K',), numbers of these images. start : (P', 3), normals by least
-    squares, or None. crop : of images.
+    depth : (P',), as of `integrate`. chosen : (K',), numbers of these images. start : (P', 3), normals by the
+    method of the start, or None. crop : of images.
     """
 
     data: Dataset
@@ -141,7 +141,7 @@ def _verdict(view: View, result: Result, status: str) -> str:
     if result.error is not None:
         facts.append(f"mean angular error {result.error:.2f}°")
         if view.start is not None:
-            facts[-1] += f" (least squares: {np.nanmean(view.data.off(view.start)):.2f}°)"
+            facts[-1] += f" (start: {np.nanmean(view.data.off(view.start)):.2f}°)"
     facts.append(f"residual {number(100 * result.history[-1]['residual'], 2)} % of the median value")
     facts += output.judgement(result)
     kind = "status" if status == "finished" else "status bad"
@@ -154,7 +154,7 @@ def _verdict(view: View, result: Result, status: str) -> str:
 
 def _shape(view: View, result: Result, truth: np.ndarray | None) -> str:
     data = view.data
-    maps = {"least squares": view.start, "result": view.guess.normals, "truth": data.truth}
+    maps = {"start": view.start, "result": view.guess.normals, "truth": data.truth}
     maps = {name: normals for name, normals in maps.items() if normals is not None}
     figures = [_figure(_coloured_normals(view.image(n, np.nan)), f"Normals: {name}") for name, n in maps.items()]
     sections = [f'<section>\n<h2>Shape</h2>\n<div class="maps">{"".join(figures)}</div>']
