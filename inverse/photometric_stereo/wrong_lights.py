@@ -79,7 +79,7 @@ def _shown(products: np.ndarray, lights: np.ndarray, k: int, others: np.ndarray)
     direction = np.linalg.lstsq(M, g, rcond=1e-9)[0]
     square = max(square, 1e-30)
     # With any exposure
-    left = square - max(g @ lights[k], 0) ** 2 / (lights[k] @ M @ lights[k])
+    left = square - max(g @ lights[k], 0) ** 2 / max(lights[k] @ M @ lights[k], 1e-30)
     off = float(angles(direction, lights[k]))
     return Wrong(int(k), tuple(unit(direction)), off, float(left / square), float((square - g @ direction) / square))
 
