@@ -224,7 +224,7 @@ def test_few_images_or_pixels_tell_nothing(folds: Dataset) -> None:
 @pytest.mark.parametrize("seed", [1022, 1040, 6024, 7018, 7074])
 def test_random_sets_are_what_their_files_say(seed: int) -> None:
     """Chrome under clipped lights; bronze; chrome and an acrylic, of which four of five values are black; chrome of
-    which all but single images are black."""
+    which nearly all values are."""
     data, _, row = random_photometric.make(seed)
     assert plausibility.judged(data).said() == [], row.label
 
