@@ -32,7 +32,8 @@ from scipy import ndimage
 from rimlight import ggx
 from rimlight.inverse import photometric_stereo as ps
 from rimlight.inverse.photometric_stereo import simulation, start
-from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
+from rimlight.inverse.photometric_stereo.vectors import unit
 from rimlight.inverse.targets import srgb_to_linear
 
 #: By how much a result may be worse than its start, mean angular error, degrees.

@@ -35,7 +35,7 @@ from .files import (
     read_truth,
 )
 from .integration import check_camera, ray_matrix
-from .vectors import LUMINANCE, every, unit
+from .vectors import LUMINANCE, directions_of, every
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class Dataset:
     intensities: np.ndarray
     #: Intrinsic matrix, (3, 3), pixels; pixel (0, 0) has its centre at (0, 0). None: orthographic.
     camera: np.ndarray | None = None
-    #: True normals, (P, 3), if known.
+    #: True normals, (P, 3), if known; (0, 0, 0) of single pixels where they are not.
     truth: np.ndarray | None = None
     #: Of the images.
     names: tuple[str, ...] = ()
@@ -120,6 +120,10 @@ class Dataset:
         """Median of the values that are not black; 1 if all are."""
         lit = self.values[self.values > 0]
         return float(np.median(lit, overwrite_input=True)) if lit.size else 1.0
+
+    def off(self, normals: np.ndarray) -> np.ndarray:
+        """Angle between normals, (P, 3), and the true ones, degrees: (P,). NaN where these are not known."""
+        return np.where(self.truth.any(1), angles(normals, self.truth), np.nan)
 
     @property
     def luminance(self) -> np.ndarray:
@@ -174,8 +178,18 @@ class Dataset:
                 "resolutions"
             )
         camera = coarser(self.camera, step)
-        truth = None if self.truth is None else unit(mean(self.truth))
+        truth = None if self.truth is None else directions_of(mean(self.truth))
+        truth = truth if truth is not None and truth.any() else None
         return replace(self, values=mean(self.values).astype(np.float32), mask=mask, camera=camera, truth=truth)
+
+    def without(self, numbers: Sequence[int]) -> Dataset:
+        """The data set without some of its images."""
+        kept = [k for k in range(len(self.lights)) if k not in numbers]
+        lights = tuple(self.lights[k] for k in kept) if self.near else self.lights[kept]
+        names = tuple(self.names[k] for k in kept) if self.names else ()
+        return replace(
+            self, values=self.values[:, kept], lights=lights, intensities=self.intensities[kept], names=names
+        )
 
     def blocks(self, step: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
         """Coarse pixels, of step x step of these: their mask, where at least half of a block is in the mask; and what

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .dataset import unit
+from .vectors import unit
 
 
 class NormalAdam:

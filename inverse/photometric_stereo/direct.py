@@ -23,7 +23,8 @@ from scipy.optimize import nnls
 
 from rimlight import ggx
 
-from .dataset import Dataset, unit
+from .dataset import Dataset
+from .vectors import unit
 
 #: Step of the finite differences by which normals are turned, radians.
 TURN = 1e-3

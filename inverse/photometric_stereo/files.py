@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -14,7 +15,9 @@ from rimlight.edge_sampling.refusals import InputError
 from rimlight.inverse.targets import read_picture, srgb_to_linear
 
 from .integration import check_camera
-from .vectors import unit
+from .vectors import directions_of
+
+log = logging.getLogger(__name__)
 
 DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
     "light_directions.txt",
@@ -196,7 +199,8 @@ def _numbers_of_picture(path: Path) -> np.ndarray:
 
 
 def read_truth(folder: Path, mask: np.ndarray) -> np.ndarray | None:
-    """Normals of the pixels of a mask, (P, 3), if the folder has them. Raises what `dataset.read` does."""
+    """Normals of the pixels of a mask, (P, 3), if the folder has them; (0, 0, 0) of those pixels of which the file has
+    no numbers. Raises what `dataset.read` does."""
     if (path := folder / "Normal_gt.exr").is_file():
         normals = _numbers_of_picture(path)
     elif (path := folder / "Normal_gt.mat").is_file():
@@ -211,4 +215,9 @@ def read_truth(folder: Path, mask: np.ndarray) -> np.ndarray | None:
         return None
     if normals is None or normals.shape != (*mask.shape, 3):
         raise InputError(f"ps: {path.name} holds no normals of the size of the mask")
-    return unit(normals[mask].astype(np.float64))
+    found = directions_of(normals[mask].astype(np.float64))
+    if missing := int((~found.any(1)).sum()):
+        log.warning(
+            "ps: %s has no normals of %d pixels of the mask; errors are those of the others", path.name, missing
+        )
+    return found if found.any() else None

@@ -285,6 +285,7 @@ def _of_images(found: Inspection) -> list[str]:
             f"{files.NAMES} and of the files of the lights."
         )
     which = np.flatnonzero(np.abs(np.log(found.exposures)) > np.log(OFF))
+    which = np.setdiff1d(which, [light.number for light in found.plausibility.wrong])
     if len(which) and found.plausibility.order.known:
         said.append(
             f"The exposure of {listed(which)} seems to be off what {files.INTENSITIES} says by more than "

@@ -23,6 +23,10 @@ CAPPED = 0.8
 #: surface: else the images do not tell the order of their lights, such as those of chrome, nearly all of it black.
 TOLD = 0.2
 
+#: And normals must differ: if they change the squared values by less than this part, as those of a flat painting, then
+#: lights of other exposures, or near ones, look like lights in other directions.
+FLAT = 0.005
+
 #: Random orders with which the given one is compared, and the largest part of them that may explain values as well.
 ORDERS, CHANCE = 300, 0.05
 
@@ -102,11 +106,11 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     lit = np.arange(len(lights)) if lit is None else lit
     if len(lit) < FEWEST:
         return Order(names)
-    C, rng = _products(values[:, lit]), np.random.default_rng(0)
+    C, rng = products(values[:, lit]), np.random.default_rng(0)
     if C is None:
         return Order(names)
     *_, third, second, first = np.linalg.eigvalsh(C)
-    if second + third < TOLD * (1 - first):
+    if second + third < max(TOLD * (1 - first), FLAT):
         return Order(names)
     projector = lambda order: _projector(lights[order[lit]])
     A = projector(np.arange(len(lights)))
@@ -132,7 +136,7 @@ def judged(values: np.ndarray, lights: np.ndarray, names: Sequence[str], lit: np
     )
 
 
-def _products(values: np.ndarray) -> np.ndarray | None:
+def products(values: np.ndarray) -> np.ndarray | None:
     """Mean products of the images, (K, K), of trace 1; None if all pixels are black in most images. All pixels count
     alike, and highlights little."""
     v = values / np.maximum(values.mean(1, keepdims=True), 1e-12 * max(values.max(), 1e-30))

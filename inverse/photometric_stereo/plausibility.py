@@ -8,12 +8,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from . import axes, black_level, files, least_squares, lights_order, start
+from . import axes, black_level, files, least_squares, lights_order, start, wrong_lights
 from .axes import Axes
 from .black_level import BlackLevel
 from .dataset import LUMINANCE, Dataset, angles
 from .lights_order import Order
 from .rendering import unlit
+from .wrong_lights import Wrong
 
 log = logging.getLogger(__name__)
 
@@ -32,13 +33,15 @@ SAME, APART = 1e-5, 1.0
 @dataclass(frozen=True)
 class Plausibility:
     """file : of the lights. copies : names of pictures that are the same, though their lights differ, by how many
-    degrees."""
+    degrees. names : of the images. wrong : lights in wrong directions."""
 
     file: str = files.DIRECTIONS
     order: Order = field(default_factory=Order)
     axes: Axes = field(default_factory=Axes)
     black_level: BlackLevel = field(default_factory=BlackLevel)
     copies: tuple[tuple[str, str, float], ...] = ()
+    names: Sequence[str] = ()
+    wrong: tuple[Wrong, ...] = ()
 
     def rows(self) -> list[tuple[str, str]]:
         """What, and how much."""
@@ -56,7 +59,14 @@ class Plausibility:
             "the right picture in the place of the copy, or take the copy and its light out."
             for first, second, apart in self.copies
         ]
-        return [*copies, *self.order.said(self.file), *of_axes, *self.black_level.said()]
+        wrong = [
+            f"The light of {self.names[w.number]} seems to be listed in a wrong direction: another one, {w.off:.0f} "
+            f"degrees away, explains all but {100 * w.least:.2g} % of its squared values, the listed one all but "
+            f"{100 * w.left:.2g} %. The image is left out of a reconstruction. Correct line {w.number + 1} of "
+            f"{self.file}, or take the image out."
+            for w in self.wrong
+        ]
+        return [*copies, *self.order.said(self.file), *wrong, *of_axes, *self.black_level.said()]
 
 
 def judged(data: Dataset) -> Plausibility:
@@ -77,13 +87,26 @@ def judged(data: Dataset) -> Plausibility:
     found = least_squares.trimmed(values[:, lit].astype(np.float64), directions[..., lit, :])
     pictured = (data.values * data.intensities.astype(np.float32)) @ LUMINANCE
     names = data.names or [f"image {k + 1}" for k in range(len(lights))]
+    order, wrong = lights_order.judged(values, lights, names, lit), []
+    if np.isfinite(order.chance) and not order.wrong:
+        wrong = _wrong(values, lights, lit)
+        if order.swapped is not None and not wrong_lights.swapped(wrong, lights, order.swapped[:2]):
+            order = replace(order, swapped=None)
     return Plausibility(
         file,
-        lights_order.judged(values, lights, names, lit),
+        order,
         axes.judged(data, least_squares.facing(found)) if len(lit) >= axes.FEWEST else Axes(),
         black_level.judged(pictured[:, lit], black_level.away(found, directions[..., lit, :])),
         _copies(pictured, lights, names, lit),
+        names,
+        tuple(wrong) if order.known else (),
     )
+
+
+def _wrong(values: np.ndarray, lights: np.ndarray, lit: np.ndarray) -> list[Wrong]:
+    """Lights in wrong directions, numbered as of all images. As of `lights_order.judged`."""
+    found = wrong_lights.judged(lights_order.products(values[:, lit]), lights[lit])
+    return [replace(wrong, number=int(lit[wrong.number])) for wrong in found]
 
 
 def _copies(
@@ -100,13 +123,14 @@ def _copies(
     return tuple(found.values())
 
 
-def check(data: Dataset) -> tuple[str, ...]:
-    """Log what is doubtful about a data set of any size, and return it."""
+def checked(data: Dataset) -> Dataset:
+    """A data set of any size without the images whose lights are wrong, and with its doubts, which are logged."""
     step = block(len(data.values))
-    said = judged(data.at(1 / step)).said() if data.blocks(step)[0].any() else []
-    for text in said:
+    found = judged(data.at(1 / step)) if data.blocks(step)[0].any() else Plausibility()
+    for text in (said := found.said()):
         log.warning("ps: %s", text)
-    return tuple(said)
+    data = replace(data, doubts=(*data.doubts, *said))
+    return data.without([wrong.number for wrong in found.wrong]) if found.wrong else data
 
 
 def block(pixels: int) -> int:

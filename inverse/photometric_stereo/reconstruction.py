@@ -24,7 +24,7 @@ from rimlight.edge_sampling.refusals import InputError
 
 from . import least_squares, plausibility, start, taking_back
 from .alternation import Alternations, Course, State, View
-from .dataset import Dataset, angles
+from .dataset import Dataset
 from .direct import Guess
 from .evidence import Judge, Kind, left_out
 from .progress import Checkpoint, Progress
@@ -174,8 +174,8 @@ class Result:
 
     @property
     def error(self) -> float | None:
-        """Mean angular error, degrees."""
-        return None if self.data.truth is None else float(angles(self.guess.normals, self.data.truth).mean())
+        """Mean angular error, degrees, of the pixels whose true normals are known."""
+        return None if self.data.truth is None else float(np.nanmean(self.data.off(self.guess.normals)))
 
 
 def reconstruct(
@@ -219,12 +219,11 @@ class Reconstruction:
         if not mi.is_rgb or mi.is_polarized:
             raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
-        self.doubts = data.doubts + plausibility.check(data)
-        self.data, self.options, self.after = data, options, after
+        self.data, self.options, self.after = plausibility.checked(data), options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
         self.rng = np.random.default_rng(options.seed)
-        self.scale = start.scale(data.at(options.resolutions[0]), options)
+        self.scale = start.scale(self.data.at(options.resolutions[0]), options)
         self.now = Progress(kind=self.kinds[0])
         self.file: Checkpoint | None = None
         self.work: Alternations | None = None
@@ -323,7 +322,7 @@ class Reconstruction:
         size = self.options.resolutions[min(now.level, len(self.options.resolutions) - 1)]
         entry = {"size": size, "seconds": now.seconds, "residual": residual}
         if level.truth is not None:
-            entry["error"] = float(angles(normals, level.truth).mean())
+            entry["error"] = float(np.nanmean(level.off(normals)))
         now.history.append(entry)
         self.bar.set_postfix({k: f"{v:.3g}" for k, v in entry.items() if k != "seconds"})
         self.bar.update()
@@ -347,7 +346,7 @@ class Reconstruction:
             curl={"start": now.start.curl, "result": best.curl},
             taken_back=1.0 if best.start else now.back,
             strength=best.strength,
-            doubts=self.doubts,
+            doubts=self.data.doubts,
             history=now.history,
             seconds=now.seconds,
         )

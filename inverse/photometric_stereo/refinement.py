@@ -16,10 +16,11 @@ import scipy.sparse as sp
 from rimlight.edge_sampling.refusals import InputError
 
 from . import laplacian
-from .dataset import Dataset, unit
+from .dataset import Dataset
 from .descent import ExponentiatedGradient, NormalAdam
 from .direct import HUBER, DirectModel, Guess
 from .rendering import Domain, Rendering
+from .vectors import unit
 
 log = logging.getLogger(__name__)
 

@@ -21,11 +21,12 @@ from rimlight.inverse.page import number
 from rimlight.sys_info import processor
 
 from . import least_squares, output
-from .dataset import LUMINANCE, Dataset, angles, unit
+from .dataset import LUMINANCE, Dataset
 from .direct import Guess
 from .integration import normals_of
 from .reconstruction import Options, Result
 from .rendering import Rendering
+from .vectors import unit
 
 #: Largest width and height of pictures in the page, pixels.
 SHOWN = 240
@@ -67,8 +68,8 @@ for (const relit of document.querySelectorAll(".relit")) {
 class View:
     """A result at the size of the page, with a few of its images only: `data` and `guess` have K' of these.
 
-    depth : (P',), as of `integrate`. chosen : (K',), numbers of these images. start : (P', 3), normals by least
-    squares, or None. crop : of images.
+    depth : (P',), as of `integrate`. chosen : (K',), numbers of these images. start : (P', 3), normals by the
+    method of the start, or None. crop : of images.
     """
 
     data: Dataset
@@ -140,7 +141,7 @@ def _verdict(view: View, result: Result, status: str) -> str:
     if result.error is not None:
         facts.append(f"mean angular error {result.error:.2f}°")
         if view.start is not None:
-            facts[-1] += f" (least squares: {angles(view.start, view.data.truth).mean():.2f}°)"
+            facts[-1] += f" (start: {np.nanmean(view.data.off(view.start)):.2f}°)"
     facts.append(f"residual {number(100 * result.history[-1]['residual'], 2)} % of the median value")
     facts += output.judgement(result)
     kind = "status" if status == "finished" else "status bad"
@@ -153,12 +154,12 @@ def _verdict(view: View, result: Result, status: str) -> str:
 
 def _shape(view: View, result: Result, truth: np.ndarray | None) -> str:
     data = view.data
-    maps = {"least squares": view.start, "result": view.guess.normals, "truth": data.truth}
+    maps = {"start": view.start, "result": view.guess.normals, "truth": data.truth}
     maps = {name: normals for name, normals in maps.items() if normals is not None}
     figures = [_figure(_coloured_normals(view.image(n, np.nan)), f"Normals: {name}") for name, n in maps.items()]
     sections = [f'<section>\n<h2>Shape</h2>\n<div class="maps">{"".join(figures)}</div>']
     if data.truth is not None:
-        errors = {name: angles(n, data.truth) for name, n in maps.items() if name != "truth"}
+        errors = {name: data.off(n) for name, n in maps.items() if name != "truth"}
         sections.append(_with_scale({f"Error: {name}": e for name, e in errors.items()}, view.image, "degrees"))
     depth = view.image(view.depth, np.nan)
     inside = np.isfinite(depth)
@@ -317,11 +318,11 @@ def _coloured(values: np.ndarray, name: str, low: float | None = None, high: flo
 
 
 def _with_scale(maps: dict[str, np.ndarray], image: Callable, unit: str) -> str:
-    """Maps of positive numbers, (P,), with one scale."""
-    limit = max(float(np.percentile(np.concatenate(list(maps.values())), 98)), 1e-6)
+    """Maps of positive numbers, (P,), with one scale. NaN where they are not known."""
+    limit = max(float(np.nanpercentile(np.concatenate(list(maps.values())), 98)), 1e-6)
     figures = []
     for name, values in maps.items():
-        caption = f"{name}, mean {number(float(values.mean()))}"
+        caption = f"{name}, mean {number(float(np.nanmean(values)))}"
         figures.append(_figure(_coloured(image(values, np.nan), "inferno", 0, limit), caption))
     return f'<div class="maps">{"".join(figures)}</div>\n{_scale("inferno", 0, limit, unit)}'
 

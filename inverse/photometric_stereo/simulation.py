@@ -21,8 +21,9 @@ from rimlight.leds import Led, emitters
 from rimlight.loading import one_line
 
 from . import dataset
-from .dataset import Dataset, unit
+from .dataset import Dataset
 from .integration import mesh_of, normals_of
+from .vectors import unit
 
 #: File of the true depth.
 TRUE_DEPTH = "Depth_gt.exr"

@@ -13,9 +13,10 @@ from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
 from . import calibration, least_squares
-from .dataset import ALL_BLACK, Dataset, unit
+from .dataset import ALL_BLACK, Dataset
 from .direct import DirectModel, Guess
 from .rendering import Domain, unlit
+from .vectors import unit
 
 if TYPE_CHECKING:
     from .reconstruction import Options
@@ -63,7 +64,9 @@ def scale(data: Dataset, options: Options) -> float:
         least_squares.trimmed(least_squares.as_at_infinity(data.values[..., c], irradiance), directions)
         for c in range(3)
     ]
-    return options.brightness / np.pi / max(np.median(np.linalg.norm(x, axis=1)) for x in b)
+    median = max(np.median(np.linalg.norm(x, axis=1)) for x in b)
+    # Where more than half of the pixels are black, nothing tells it
+    return options.brightness / np.pi / median if median > 0 else 1.0
 
 
 def flat(data: Dataset) -> DirectModel:

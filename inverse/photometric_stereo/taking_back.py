@@ -10,8 +10,8 @@ import numpy as np
 from scipy import ndimage
 
 from .alternation import Alternations, State
-from .dataset import unit
 from .direct import DirectModel
+from .vectors import unit
 
 #: Pixels at which this is judged, at most; and at a time, for memory.
 JUDGED, BLOCK = 10000, 2**12

@@ -14,6 +14,12 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), [0, 0, 1])
 
 
+def directions_of(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length 1; those of length 0, or not finite, are (0, 0, 0)."""
+    known = np.isfinite(vectors).all(-1, keepdims=True) & vectors.any(-1, keepdims=True)
+    return np.where(known, unit(np.where(known, vectors, 0)), 0)
+
+
 def every(array: np.ndarray, most: int) -> np.ndarray:
     """At most so many rows of an array, evenly."""
     return array[:: -(-len(array) // most) or 1]

@@ -21,9 +21,10 @@ import numpy as np
 from _bench import Benchmark, Settings, main, say, table
 
 from rimlight import ggx
-from rimlight.inverse.photometric_stereo.dataset import Dataset, unit
+from rimlight.inverse.photometric_stereo.dataset import Dataset
 from rimlight.inverse.photometric_stereo.direct import Guess
 from rimlight.inverse.photometric_stereo.rendering import Rendering
+from rimlight.inverse.photometric_stereo.vectors import unit
 
 SIZE, CURVATURE, LIGHT = 32, 0.87, (0.25, 0.15, 1.0)
 UNCERTAINTY, NOISE, FLOOR = 0.1, 0.01, 0.002

@@ -26,7 +26,7 @@ import numpy as np
 # isort: on
 
 from rimlight.inverse.photometric_stereo import dataset, least_squares, reconstruction
-from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
+from rimlight.inverse.photometric_stereo.dataset import Dataset
 
 #: In the order of published tables.
 OBJECTS = ("ball", "bear", "buddha", "cat", "cow", "goblet", "harvest", "pot1", "pot2", "reading")
@@ -53,7 +53,7 @@ def rows(folder: Path, camera: np.ndarray | None, rig: float, size: float, known
     for method in least_squares.METHODS:
         if (name, method) not in known:
             found = least_squares.normals(data.at(size).luminance, data.lights, method)
-            yield {"object": name, "row": method, "error": float(angles(found, data.at(size).truth).mean())}
+            yield {"object": name, "row": method, "error": float(np.nanmean(data.at(size).off(found)))}
     sets = {DEFAULTS: data}
     if camera is not None:
         sets[WITH_RIG] = with_rig(folder, data, camera, rig)

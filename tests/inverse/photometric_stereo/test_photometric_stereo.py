@@ -15,12 +15,13 @@ from rimlight import ggx
 from rimlight.checks import mean_and_error
 from rimlight.inverse.photometric_stereo import reconstruction, refinement
 from rimlight.inverse.photometric_stereo.alternation import Alternations, State
-from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.descent import ExponentiatedGradient, NormalAdam
 from rimlight.inverse.photometric_stereo.direct import HUBER, DirectModel, Guess, simplex_least_squares
 from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering
 from rimlight.inverse.photometric_stereo.simulation import spiral
+from rimlight.inverse.photometric_stereo.vectors import unit
 from rimlight.leds import Led
 
 # ------------------------------------------------------------------ direct light

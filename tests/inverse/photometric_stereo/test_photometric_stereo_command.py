@@ -16,9 +16,10 @@ from rimlight import ggx
 from rimlight.cli import _ps, main
 from rimlight.exr import read_exr, write_exr
 from rimlight.inverse.photometric_stereo import cost, dataset, output, reconstruction, report, simulation
-from rimlight.inverse.photometric_stereo.dataset import angles, unit
+from rimlight.inverse.photometric_stereo.dataset import angles
 from rimlight.inverse.photometric_stereo.integration import normals_of
 from rimlight.inverse.photometric_stereo.rendering import Rendering
+from rimlight.inverse.photometric_stereo.vectors import unit
 
 N, LIGHTS = 24, 12
 SMALL = {"size": N, "lights": LIGHTS, "spp": 16}

@@ -45,7 +45,7 @@ def test_strong_compression_is_said(data: Dataset, tmp_path: Path, caplog, quali
     """Where the files are read, by the reconstruction, whose result keeps it, and by the inspection."""
     read = ps.read(write_jpeg(tmp_path, data, quality))
     assert (TEXT in caplog.text) == said
-    doubts = Reconstruction(read, ps.Options()).doubts
+    doubts = Reconstruction(read, ps.Options()).data.doubts
     seen = inspection.inspect(tmp_path)
     for found in (doubts, inspection.warnings(seen)):
         assert any(f"{TEXT} of quality {quality}" in text for text in found) == said

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from photometric import LAMBERT, UP, disc, glossy
 from PIL import Image
+from scipy.io import savemat
 from skimage import io
 
 from rimlight import ggx
@@ -19,9 +20,10 @@ from rimlight.cli import main
 from rimlight.exr import write_exr
 from rimlight.inverse.photometric_stereo import calibration, dataset, least_squares
 from rimlight.inverse.photometric_stereo.calibration import Ball
-from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import DirectModel, Guess
 from rimlight.inverse.photometric_stereo.simulation import spiral
+from rimlight.inverse.photometric_stereo.vectors import unit
 from rimlight.leds import Led
 
 # ------------------------------------------------------------------ data sets
@@ -62,6 +64,33 @@ def test_data_sets_are_read_as_written(tmp_path: Path, near: bool) -> None:
     else:
         assert found.camera is None
         np.testing.assert_allclose(found.lights, data.lights, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["exr", "mat"])
+def test_true_normals_that_are_not_known_of_all_pixels(tmp_path: Path, caplog, kind: str) -> None:
+    """NaN or 0 in the file: such pixels have no error, of coarse images either."""
+    data = small()
+    dataset.write(tmp_path, data)
+    normals = data.image(data.truth)
+    rows, columns = np.nonzero(data.mask)
+    normals[rows[:3], columns[:3]] = np.nan
+    normals[rows[3], columns[3]] = 0
+    if kind == "mat":
+        (tmp_path / "Normal_gt.exr").unlink()
+        savemat(tmp_path / "Normal_gt.mat", {"Normal_gt": normals})
+    else:
+        write_exr(tmp_path / "Normal_gt.exr", {"": normals.astype(np.float32)})
+    found = dataset.read(tmp_path)
+    assert f"Normal_gt.{kind} has no normals of 4 pixels" in caplog.text
+    off = found.off(np.tile(UP, (len(data.values), 1)))
+    np.testing.assert_array_equal(np.isnan(off), np.arange(len(off)) < 4)
+    np.testing.assert_allclose(off[4:], angles(np.array(UP), data.truth)[4:], atol=1e-4)
+    coarse = found.at(0.5)
+    assert np.isfinite(coarse.truth).all() and np.isfinite(coarse.off(coarse.truth)).any()
+    normals[:] = np.nan
+    savemat(tmp_path / "Normal_gt.mat", {"Normal_gt": normals})
+    (tmp_path / "Normal_gt.exr").unlink(missing_ok=True)
+    assert dataset.read(tmp_path).truth is None
 
 
 def test_lights_at_a_distance(tmp_path: Path) -> None:

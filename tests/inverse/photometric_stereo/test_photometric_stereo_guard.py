@@ -31,10 +31,11 @@ from rimlight.inverse.photometric_stereo import (
     start,
     taking_back,
 )
-from rimlight.inverse.photometric_stereo.dataset import Dataset, angles, unit
+from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import Guess
 from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering, unlit
+from rimlight.inverse.photometric_stereo.vectors import unit
 
 N = 24
 QUICK = {"resolutions": (1.0,), "iterations": (2,), "max_depth": 2, "brightness": 0.0}

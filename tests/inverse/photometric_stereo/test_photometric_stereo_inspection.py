@@ -14,7 +14,8 @@ from rimlight.cli import main
 from rimlight.exr import write_exr
 from rimlight.inverse import photometric_stereo as ps
 from rimlight.inverse.photometric_stereo import cost, dataset, inspection, simulation
-from rimlight.inverse.photometric_stereo.dataset import Dataset, unit
+from rimlight.inverse.photometric_stereo.dataset import Dataset
+from rimlight.inverse.photometric_stereo.vectors import unit
 
 N, LIGHTS = 24, 24
 

@@ -13,9 +13,18 @@ import random_photometric
 
 from rimlight.cli import main
 from rimlight.inverse import photometric_stereo as ps
-from rimlight.inverse.photometric_stereo import axes, dataset, inspection, lights_order, plausibility, simulation
+from rimlight.inverse.photometric_stereo import (
+    axes,
+    dataset,
+    inspection,
+    lights_order,
+    plausibility,
+    simulation,
+    wrong_lights,
+)
 from rimlight.inverse.photometric_stereo.dataset import Dataset
 from rimlight.inverse.photometric_stereo.reconstruction import Reconstruction
+from rimlight.inverse.photometric_stereo.vectors import unit
 
 LIGHTS = 24
 
@@ -49,6 +58,17 @@ def brighter(data: Dataset, part: float) -> Dataset:
     return dataclasses.replace(data, values=data.values + np.float32(part * np.median(data.values)))
 
 
+def turned(data: Dataset, *numbers: int, degrees: float = 20.0) -> Dataset:
+    """With some lights in wrong directions, nearer to the camera's axis or farther from it."""
+    lights, angle = data.lights.copy(), np.radians(degrees)
+    for k in numbers:
+        away = np.arctan2(np.hypot(*lights[k, :2]), lights[k, 2])
+        then = away + angle if away < np.pi / 4 else away - angle
+        lights[k, :2] *= np.sin(then) / np.sin(away)
+        lights[k, 2] = np.cos(then)
+    return dataclasses.replace(data, lights=lights)
+
+
 def exchanged(*pair: int) -> np.ndarray:
     order = np.arange(LIGHTS)
     order[list(pair)] = pair[::-1]
@@ -66,6 +86,10 @@ FAULTS = {
     "exchanged": (lambda d: with_axes(d, "y x"), "write y x for x y if the object bulges"),
     "turned": (lambda d: with_axes(d, "y -x"), "write -y x for x y if the object bulges"),
     "turned back": (lambda d: with_axes(d, "-y x"), "write y -x for x y if the object bulges"),
+    "a wrong light": (
+        lambda d: turned(d, 7),
+        "The light of 8.exr seems to be listed in a wrong direction: another one",
+    ),
     "black level": (lambda d: brighter(d, 0.05), "seems to be added to all values, 5 % of the median one"),
 }
 
@@ -197,10 +221,10 @@ def test_few_images_or_pixels_tell_nothing(folds: Dataset) -> None:
     assert [value.split(",")[0] for _, value in plausibility.judged(small).rows()] == ["not judged"] * 3
 
 
-@pytest.mark.parametrize("seed", [1022, 1040, 1053, 6024, 7018])
+@pytest.mark.parametrize("seed", [1022, 1040, 6024, 7018, 7074])
 def test_random_sets_are_what_their_files_say(seed: int) -> None:
-    """Chrome under clipped lights; bronze; nine lights, of which one is wrong, on silver paint; chrome and an acrylic,
-    of which four of five values are black."""
+    """Chrome under clipped lights; bronze; chrome and an acrylic, of which four of five values are black; chrome of
+    which nearly all values are."""
     data, _, row = random_photometric.make(seed)
     assert plausibility.judged(data).said() == [], row.label
 
@@ -235,13 +259,77 @@ def test_inspection_of_large_photographs(shared) -> None:
     assert found.order.chance == 0
 
 
+def test_flat_paintings_tell_nothing_of_their_lights() -> None:
+    """With a relief of up to 6 degrees. Other exposures, noise, and lights that are near and so brighter on their side,
+    looked like another order, swapped lights, or lights in wrong directions."""
+    judged = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        lights = rng.permutation(simulation.spiral(int(rng.choice([6, 8, 10, 16, 24, 40])), rng.uniform(25, 70)))
+        relief = rng.choice([0, 0.01, 0.05, 0.1]) * rng.standard_normal((1500, 2))
+        values = np.maximum(unit(np.c_[relief, np.ones(1500)]) @ lights.T, 0) * rng.uniform(0.1, 0.9, (1500, 1))
+        values *= np.exp(rng.choice([0, 0.05]) * rng.standard_normal(len(lights)))
+        values *= 1 + rng.choice([0, 0.1]) * (rng.uniform(-1, 1, (1500, 2)) @ lights[:, :2].T)
+        values += rng.choice([0, 0.01]) * values.mean() * rng.standard_normal(values.shape)
+        order = lights_order.judged(values, lights, [str(k) for k in range(len(lights))])
+        assert order.known, (seed, order)
+        judged += np.isfinite(order.chance)
+        assert wrong_lights.judged(lights_order.products(values), lights) == [], seed
+    assert judged < 20
+
+
+# ------------------------------------------------------------------ single wrong lights
+
+
+@pytest.mark.parametrize(("seed", "wrong"), [(1053, [0]), (6027, [10, 14]), (6028, [8, 19]), (1018, [3])])
+def test_wrong_lights_of_random_sets(seed: int, wrong: list[int]) -> None:
+    """Nine lights on silver paint; gold paint under lights close together; a blue phenolic; one that is off by 9
+    degrees. All that are wrong are told, and no other."""
+    data, *_ = random_photometric.make(seed)
+    right, *_ = random_photometric.make(seed, "wrong lights")
+    off = dataset.angles(data.lights, right.lights)
+    assert list(np.flatnonzero(off > 5)) == wrong
+    found = plausibility.judged(data).wrong
+    assert [light.number for light in found] == wrong
+    for light in found:
+        assert abs(light.off - off[light.number]) < 4
+
+
+def test_images_of_wrong_lights_are_left_out(folds: Dataset) -> None:
+    work = Reconstruction(turned(folds, 3, 16), ps.Options())
+    assert len(work.data.doubts) == 2
+    kept = np.delete(np.arange(LIGHTS), [3, 16])
+    np.testing.assert_array_equal(work.data.values, folds.values[:, kept])
+    np.testing.assert_array_equal(work.data.lights, folds.lights[kept])
+    assert work.data.names == tuple(folds.names[k] for k in kept)
+
+
+def test_a_black_image_does_not_shift_the_numbers_of_wrong_lights(folds: Dataset) -> None:
+    values = folds.values.copy()
+    values[:, 2] *= 0.01
+    found = plausibility.judged(turned(dataclasses.replace(folds, values=values), 7))
+    assert [light.number for light in found.wrong] == [7] and "8.exr" in found.said()[0]
+
+
+def test_which_lights_are_wrong_may_be_unknown(folds: Dataset) -> None:
+    """With few images; if many are; and if only the wrong one is beside a line of lights."""
+    few = folds.without(range(7, LIGHTS))
+    assert plausibility.judged(turned(few, 2)).wrong == ()
+    many = turned(folds, *range(0, LIGHTS, 4), degrees=25)
+    assert plausibility.judged(many).wrong == ()
+    line = unit(np.stack([np.linspace(-1, 1, 9), np.zeros(9), np.ones(9)], 1))
+    values = np.maximum(simulation.spiral(200, 50) @ line.T, 0)
+    line[4] = unit(np.array([0, 1, 1.0]))
+    assert wrong_lights.judged(lights_order.products(values), line) == []
+
+
 # ------------------------------------------------------------------ parts
 
 
 def test_a_gain_of_swapped_lights() -> None:
     """Reckoned for all pairs at once, as for one after the other."""
     rng = np.random.default_rng(0)
-    C, A = lights_order._products(rng.random((50, 9))), lights_order._projector(rng.standard_normal((9, 3)))
+    C, A = lights_order.products(rng.random((50, 9))), lights_order._projector(rng.standard_normal((9, 3)))
     for i, j in [(0, 5), (3, 4), (8, 1)]:
         order = np.arange(9)
         order[[i, j]] = j, i
@@ -257,7 +345,7 @@ def test_predictions_by_all_others() -> None:
     others = np.arange(7) != 2
     b = np.linalg.lstsq(lights[others], capped[:, others].T, rcond=None)[0]
     expected = np.square(lights[2] @ b - capped[:, 2]).sum() / np.square(capped[:, 2]).sum()
-    off = lights_order._off(lights_order._products(values), lights_order._projector(lights))
+    off = lights_order._off(lights_order.products(values), lights_order._projector(lights))
     np.testing.assert_allclose(off[2], expected, rtol=1e-9)
 
 
