@@ -247,10 +247,11 @@ class ShadingBoundary:
             n_dl = dr.cross(ω, outline.tangent) / (distance * sample.density)
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
             # Seen along its own face, an edge hides nothing, but rounding decides what a ray past it meets.
-            active = active & (sample.density > 0) & ~in_plane(si, p)
+            active = active & (sample.density > 0) & ~in_plane(si, p, outline.slack)
             active &= dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
             outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
+            sign = dr.select(outward != 0, outline.sign, 1)
             # Of a crease, both sides are faces of its own.
             near = dr.detach(1 - division.held(dr.square(distance), ω))
             active &= (outward != 0) | (near > 0)
@@ -273,6 +274,7 @@ class ShadingBoundary:
                     # Where only the planes of its faces hide something, light comes from between them.
                     beside = ~past
                     soft = beside & self.silhouettes.only_bends(sample) & spreads(y.bsdf()) & self.soft
+                    soft &= outline.slack == 0
                     lune = Lune.between(outline.tangent, outline.normals, soft)
                 found = _found_from_points(point, p, y, ω, past & ~outline.is_line)
                 scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune, found)
@@ -297,7 +299,7 @@ class ShadingBoundary:
             value = L * (edge - held * turning(n_dl, d, valid) - (1 - held) * turned)
             # From lamps, shadows are found as if directions did not turn, and none of the part of which they do.
             value += from_lamp * (dr.detach(division.turns(dr.squared_norm(d), ω)) * edge - (1 - held) * turned)
-            return faces * (edge - turned) - side * value
+            return sign * (faces * (edge - turned) - side * value)
 
     def _shown_by_faces(
         self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune
