@@ -251,7 +251,6 @@ class ShadingBoundary:
             active &= dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
             outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
-            sign = dr.select(outward != 0, outline.sign, 1)
             # Of a crease, both sides are faces of its own.
             near = dr.detach(1 - division.held(dr.square(distance), ω))
             active &= (outward != 0) | (near > 0)
@@ -273,8 +272,7 @@ class ShadingBoundary:
                 if self.smooth:
                     # Where only the planes of its faces hide something, light comes from between them.
                     beside = ~past
-                    soft = beside & self.silhouettes.only_bends(sample) & spreads(y.bsdf()) & self.soft
-                    soft &= outline.slack == 0
+                    soft = beside & self.silhouettes.only_bends(sample, outline) & spreads(y.bsdf()) & self.soft
                     lune = Lune.between(outline.tangent, outline.normals, soft)
                 found = _found_from_points(point, p, y, ω, past & ~outline.is_line)
                 scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune, found)
@@ -299,6 +297,7 @@ class ShadingBoundary:
             value = L * (edge - held * turning(n_dl, d, valid) - (1 - held) * turned)
             # From lamps, shadows are found as if directions did not turn, and none of the part of which they do.
             value += from_lamp * (dr.detach(division.turns(dr.squared_norm(d), ω)) * edge - (1 - held) * turned)
+            sign = dr.select(past, outline.sign, 1)
             return sign * (faces * (edge - turned) - side * value)
 
     def _shown_by_faces(

@@ -233,11 +233,12 @@ class Silhouettes:
         still = (sample.edge < self.count) & dr.gather(mi.Bool, self._still, dr.minimum(sample.edge, self.count - 1))
         return dr.select(still, use[1], use[0])
 
-    def only_bends(self, sample: EdgeSample) -> mi.Bool:
+    def only_bends(self, sample: EdgeSample, outline: OutlinePoint) -> mi.Bool:
         """Is it on an edge across which nothing differs but the planes of two smooth-shaded faces?"""
         if self.tree is None:
             return mi.Bool(False)
-        return (sample.edge < self.count) & self.tree.device_edges.is_smooth(dr.minimum(sample.edge, self.count - 1))
+        of_mesh = (sample.edge < self.count) & (outline.slack == 0)
+        return of_mesh & self.tree.device_edges.is_smooth(dr.minimum(sample.edge, self.count - 1))
 
     def beside(
         self, scene: mi.Scene, placement: Placement, sample: EdgeSample, p: mi.Point3f, x: mi.Point3f
