@@ -297,8 +297,7 @@ class ShadingBoundary:
             value = L * (edge - held * turning(n_dl, d, valid) - (1 - held) * turned)
             # From lamps, shadows are found as if directions did not turn, and none of the part of which they do.
             value += from_lamp * (dr.detach(division.turns(dr.squared_norm(d), ω)) * edge - (1 - held) * turned)
-            sign = dr.select(past, outline.sign, 1)
-            return sign * (faces * (edge - turned) - side * value)
+            return dr.select(past, outline.sign, 1) * (faces * (edge - turned) - side * value)
 
     def _shown_by_faces(
         self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune
