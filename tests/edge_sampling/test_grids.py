@@ -53,26 +53,6 @@ def test_vertices_lie_on_the_surface():
     assert np.median(np.abs(t - 0.05)) < 1e-5 and np.mean(np.abs(t - 0.05) < 1e-3) > 0.99
 
 
-def test_outlines_bent_inwards_make_up_for_others():
-    """The line of all silhouettes of a ball runs back and forth. With its sign, it is as long as a circle."""
-    p, faces = surface(ball(33))
-    eye = np.array([24.0, 20.0, 25.0])
-    a, b, c = (p[faces[:, k]] for k in range(3))
-    n = np.cross(b - a, c - a)
-    facing = np.einsum("ij,ij->i", n, eye - a) > 0
-    sides, face = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), np.repeat(np.arange(len(faces)), 3)
-    order = np.argsort(np.sort(sides, axis=1) @ [len(p), 1], kind="stable")
-    first, second = order[::2], order[1::2]
-    seen = facing[face[first]] != facing[face[second]]
-    first, second = first[seen], second[seen]
-    start, end = p[sides[first, 0]], p[sides[first, 1]]
-    inwards = np.einsum("ij,ij->i", n[face[first]], p[faces[face[second]]].sum(1) - 3 * start) > 0
-    direction = lambda q: (q - eye) / np.linalg.norm(q - eye, axis=1, keepdims=True)
-    length = np.linalg.norm(eye) * np.linalg.norm(direction(start) - direction(end), axis=1)
-    assert np.isclose(length[~inwards].sum() - length[inwards].sum(), 2 * np.pi * 0.7, rtol=0.02)
-    assert length.sum() > 1.2 * 2 * np.pi * 0.7
-
-
 def small(**options) -> mi.Scene:
     return cases.scene(
         sensor=cases.camera(*grids.LOOK, film={**cases.film(), "width": 12, "height": 12}),
