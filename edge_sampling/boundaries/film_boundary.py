@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.device_edges import line_of_sight, rounding
+from rimlight.edge_sampling.geometry.device_edges import GRID_MET, line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
 from rimlight.edge_sampling.lights import Lights
@@ -31,6 +31,9 @@ from .horizon import Horizon
 from .lune import Lune
 from .tracer import Tracer
 from .veils import is_veil
+
+#: How often the distance is halved in which the outline of a grid is known to be.
+HALVINGS = 4
 
 
 @dataclass(frozen=True)
@@ -178,16 +181,50 @@ class FilmBoundary:
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             offset = self._offset(scene, at, p, chosen) * dr.normalize(n_dl)
-            rays, weights = _beside(at, sensor, sampler, u, offset, active)
+            beside, offset = self._on_grid(tracer, at, sensor, chosen, u, p, offset, active)
+            rays, weights = _beside(at, sensor, sampler, beside, offset, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
             active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
-            n_dl = dr.select(active, n_dl, 0)
+            n_dl = dr.select(active, n_dl * self._sign(at, chosen), 0)
             shared = self._lune(at, chosen, lights, p, rays, met)
             if tracer.shares_directions:
                 shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
             sensor_moves = at.projection.attached
-            return BoundaryPoints(u, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
+            return BoundaryPoints(beside, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
+
+    def _on_grid(self, tracer: Tracer, at: Placed, sensor, chosen: Chosen, u, p, offset, active) -> tuple:
+        """Where to look at the outline of a grid, or at a crease between its voxels, which are only somewhere between
+        u − offset and u + offset: there, and the offset from there, both by bisection."""
+        edges = self.outlines.edges
+        if edges is None or not edges.any_grid:
+            return u, offset
+        active = active & chosen.is_edge & edges.is_of_grid(chosen.edge)
+        outline = self._is_outline_of_grid(at, chosen)
+
+        def side(part, active):
+            """What is met there: nothing (0), the grid (1), or which of its voxels."""
+            lens = mi.Point2f(0.5) if at.aperture_sample is None else at.aperture_sample
+            on_film = (u + part * offset - at.projection.crop_offset) / at.projection.crop_size
+            ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, on_film, lens, active)
+            pi = tracer.first_hit(ray, active)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+            met = edges.meets_grid(at.positions, chosen.edge, p, si, outline)
+            return dr.select(met, dr.select(outline, 1, pi.prim_index + 1), 0)
+
+        one = dr.full(mi.Float, 1, dr.width(u))
+        first = side(-one, active)
+        active &= first != side(one, active)
+
+        def halve(k, low, high):
+            middle = 0.5 * (low + high)
+            same = side(middle, active) == first
+            return k + 1, dr.select(same, middle, low), dr.select(same, high, middle)
+
+        state = (dr.zeros(mi.UInt32, dr.width(u)), -one, one)
+        _, low, high = dr.while_loop(state, lambda k, *_: active & (k < HALVINGS), halve, label="outlines of grids")
+        middle, rest = 0.5 * (low + high), dr.select(active, 0.5 * (high - low), 1)
+        return u + dr.select(active, middle, 0) * offset, rest * offset
 
     # ---------------------- What is on their sides ----------------------
 
@@ -249,17 +286,39 @@ class FilmBoundary:
                     jumps &= ~joined | there | ((sign * faces[0] < 0) & (sign * faces[1] < 0))
         return jumps
 
+    def _sign(self, at: Placed, chosen: Chosen) -> mi.Float:
+        """With which sign the points count, see `OutlinePoint.sign`."""
+        edges = self.outlines.edges
+        if edges is None or not edges.any_grid:
+            return mi.Float(1)
+        back = self._is_outline_of_grid(at, chosen) & edges.is_concave(at.positions, chosen.edge)
+        return dr.select(back, mi.Float(-1), 1)
+
+    def _is_outline_of_grid(self, at: Placed, chosen: Chosen) -> mi.Bool:
+        """Is a point on a silhouette of the surface of a grid?"""
+        edges, projection = self.outlines.edges, at.projection
+        view, eye = projection.view() if projection.orthographic else None, projection.eye(at.aperture_sample)
+        silhouette = edges.is_silhouette(at.positions, chosen.edge, eye, view)
+        return chosen.is_edge & edges.is_of_grid(chosen.edge) & silhouette
+
     def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays) -> list[Horizon | None]:
         """On which side of a horizon of interpolated normals each of two rays is."""
-        if self.outlines.horizons is None:
+        edges = self.outlines.edges
+        any_grid = edges is not None and edges.any_grid
+        if self.outlines.horizons is None and not any_grid:
             return [None, None]
-        side = mi.Float(0)
-        if self.outlines.edges is not None:
+        side, reach = mi.Float(0), mi.Float(0)
+        if self.outlines.horizons is not None and edges is not None:
             # Where a curve runs between the two rays beside an edge, its jump is not that of the edge.
             sight = line_of_sight(p, rays)
             side = self.outlines.edges.facing(at.normals, self.outlines.horizons.sign, chosen.edge, found.t, -sight)
             side = dr.select(chosen.is_edge & self.outlines.edges.is_fold(at.positions, chosen.edge, p, sight), side, 0)
-        return [Horizon(dr.select(chosen.is_horizon, mi.Float(sign), side), p, chosen.is_horizon) for sign in (-1, 1)]
+        if any_grid:
+            # Where smooth normals turn away just inside of an outline, both jumps count as one.
+            outline = self._is_outline_of_grid(at, chosen)
+            side, reach = dr.select(outline, 1, side), dr.select(outline, GRID_MET * edges.slack(chosen.edge), 0)
+        sides = [dr.select(chosen.is_horizon, mi.Float(sign), side) for sign in (-1, 1)]
+        return [Horizon(s, p, chosen.is_horizon, reach) for s in sides]
 
     def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart.

@@ -11,6 +11,7 @@ import numpy as np
 from rimlight.edge_sampling.geometry.curves import CurvePoint, Curves
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import EdgeKind, Edges
+from rimlight.edge_sampling.geometry.grids import grids_of, is_grid
 from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
@@ -89,22 +90,23 @@ class FilmOutlines:
     geometry, edges, moving, soft, seams : see `FilmBoundary`.
     """
 
-    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "lines")
+    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "lines", "grids")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, edges: Edges, moving: np.ndarray, *, soft: bool, seams: bool):
         self.geometry, self.soft = geometry, soft
-        self.lines = geometry.lines
+        self.lines, self.grids = geometry.lines, grids_of(geometry)
         edges, faces = edges.of_meshes(moving, lines=geometry.any_line(moving)), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays: if curves alone move, one face without area stands for all.)
         faces = faces if len(faces) else np.zeros((1, 3), np.uint32)
         self.edges = DeviceEdges(edges, geometry) if len(edges) else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
         #: Which edges are on meshes that reflect light from all directions, but from behind?
-        spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes] or [False])
+        known = [m.bsdf() if not is_grid(m) else None for m in geometry.meshes]
+        spread = np.array([bsdf is not None and spreads(bsdf) for bsdf in known] or [False])
         self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
         #: And which on meshes that are matt? None where these have few creases, and there is little to gain.
-        matt = np.array([m.bsdf() is not None and is_matt(m.bsdf()) for m in geometry.meshes] or [False])
+        matt = np.array([bsdf is not None and is_matt(bsdf) for bsdf in known] or [False])
         matt = matt[edges.mesh].all(1)
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
@@ -226,7 +228,7 @@ class FilmOutlines:
             geometry=self.geometry if creases else None,
         )
         if lights is not None:
-            jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights)
+            jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights) & ~self.edges.is_of_grid(edge)
         return jumps
 
     def visible_lengths(self, at: Placed, lights: mi.Vector4f | None, by_angle: bool) -> mi.Float:

@@ -40,11 +40,13 @@ class Horizon:
     p : mi.Point3f, (N,), a point of the curve, or of an edge that such a curve may be close to, world space: what hides
         it is none of its sides.
     on_curve : mi.Bool, (N,), is it one of the curve? Then the normal *just* faces the viewer, or faces away.
+    reach : mi.Float, (N,), how far from p, across the surface, besides rounding, what it belongs to may be met.
     """
 
     side: mi.Float
     p: mi.Point3f
     on_curve: mi.Bool
+    reach: mi.Float
 
 
 @dataclass
@@ -228,7 +230,7 @@ def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -
     """
     to_viewer = -ray.d
     cos = dr.dot(si.sh_frame.n, to_viewer)
-    there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o)
+    there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o) + horizon.reach
     turn = there & si.is_valid() & (horizon.side != 0) & (horizon.on_curve | (horizon.side * cos <= 0))
     _turn(si, to_viewer, horizon.side, turn)
 

@@ -22,7 +22,7 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
-from rimlight.edge_sampling.geometry.other_cuts import cuts_of_others
+from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
@@ -238,11 +238,11 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
 def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving) -> list[str]:
     """What lacks at the outlines of shapes."""
     limits = []
-    grids = names(s for s in scene.shapes() if s.class_name() == "SDFGrid")
+    grids = names(s for s in geometry.others if s.class_name() == "SDFGrid")
     if grids:
         limits.append(
-            f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid). Replace "
-            "them by meshes."
+            f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid), which are not "
+            "known: give the grid as many values along each axis as along the others."
         )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:
@@ -257,6 +257,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
         limits.append(
             "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
             f"such nor meshes: {pairs}. Replace them by meshes."
+        )
+    pairs = [f'"{a.id()}" and "{b.id()}"' for a, b in cuts_of_grids(scene, geometry)]
+    if pairs:
+        limits.append(
+            f"the derivative lacks the curves in which grids of signed distances cut through other shapes: "
+            f"{', '.join(pairs)}. Replace the grids by meshes, or move them apart."
         )
     closed = {
         tuple(geometry.meshes[i].id() for i in pair): width

@@ -1,0 +1,385 @@
+"""The surface of an `sdfgrid`, divided into triangles, whose edges stand for its silhouettes.
+
+Inside of a voxel, Mitsuba interpolates the values of the grid trilinearly. The surface f = 0 meets each edge of the
+voxel where a linear function vanishes, and each of its faces in a hyperbola: there, the surface is bent. So the places
+on edges of voxels are vertices, those on one face are joined by a line, and the lines of a voxel form loops. From the
+middle of each, brought to f = 0, triangles go to its lines.
+
+Vertices follow the values of the grid, and the shape: on the edge of a voxel, p = a + (b − a) f_a / (f_a − f_b); in the
+middle, by one step of Newton's method, p − f(p) ∇f / |∇f|².
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .meshes import Geometry
+
+#: Corners of a voxel: the bits of their numbers are x, y, z. Faces, as seen from outside, counter-clockwise.
+CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])
+FACES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6))
+
+#: Edges of a voxel: their corners, in the sense of their axis.
+EDGES = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
+
+#: Steps of Newton's method from the mean of a loop to the surface.
+STEPS = 4
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """The surface of a grid, on the host. Vertices on edges of voxels come first.
+
+    ends : (V₁, 2), int64; the grid values between which they lie. axis : (V₁,); along which axis.
+    corners : (V₂, 8), int64; of the voxels in which the others are. middle : (V₂, 3); where there, from 0 to 1.
+    faces : (F, 3), uint32; counter-clockwise, as seen from where values are positive.
+    slack : (V,); how far about each vertex the triangles are from the surface, in voxels.
+    """
+
+    ends: np.ndarray
+    axis: np.ndarray
+    corners: np.ndarray
+    middle: np.ndarray
+    faces: np.ndarray
+    slack: np.ndarray
+
+
+def _next_edges(f: np.ndarray) -> np.ndarray:
+    """Of each edge of voxels on which the surface lies, the next one around the loop: (N, 12); -1 where it does not.
+    f : values at the corners, (N, 8)."""
+    number = {frozenset(e): k for k, e in enumerate(EDGES)}
+    inside, following = f < 0, np.full((len(f), 12), -1, np.int8)
+    for face in FACES:
+        c = list(face)
+        edge = [number[frozenset((c[k], c[k - 3]))] for k in range(4)]
+        s = inside[:, c]
+        enters, leaves = ~s & np.roll(s, -1, 1), s & ~np.roll(s, -1, 1)
+        # Where the signs alternate, the saddle of the bilinear values tells which corners are joined.
+        twice, even = enters.sum(1) == 2, s[:, 0]
+        g = f[:, c]
+        first, second = g[:, 0] * g[:, 2], g[:, 1] * g[:, 3]
+        apart = np.where(even, first < second, second < first)
+        for k in range(4):
+            rows = np.flatnonzero(enters[:, k])
+            end = np.where(twice, np.where(apart, (k + 1) % 4, (k - 1) % 4), leaves.argmax(1))
+            following[rows, edge[k]] = np.array(edge)[end[rows]]
+    return following
+
+
+def _trilinear(f: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value (N,) and gradient (N, 3), by voxels, at places u (N, 3) in voxels with the corners f (N, 8)."""
+    weight = np.where(CORNERS, u[:, None], 1 - u[:, None])  # (N, 8, 3)
+    value = (f * weight.prod(2)).sum(1)
+    sign = np.where(CORNERS, 1, -1)
+    others = np.stack([np.delete(weight, k, 2).prod(2) for k in range(3)], 2)
+    return value, (f[..., None] * sign * others).sum(1)
+
+
+def triangulate(values: np.ndarray) -> Triangles:
+    """Divide the surface of a grid of values, (Z, Y, X), into triangles."""
+    size = np.array(values.shape[::-1])
+    stride = np.array([1, size[0], size[0] * size[1]])
+    offset, flat = CORNERS @ stride, values.ravel().astype(np.float64)
+    z, y, x = (a.ravel() for a in np.meshgrid(*(np.arange(n - 1) for n in values.shape), indexing="ij"))
+    base = np.stack([x, y, z], 1) @ stride
+    negative = (flat < 0)[base[:, None] + offset].sum(1)
+    base = base[(negative > 0) & (negative < 8)]
+    corners = base[:, None] + offset
+    f = flat[corners]
+    following = _next_edges(f)
+    voxel, edge = np.nonzero(following >= 0)
+    after = following[voxel, edge]
+
+    # ---------------------- Vertices on edges of voxels ----------------------
+
+    a, b = np.array(EDGES).T
+    axis = np.repeat(np.arange(3), 4)
+    key = corners[:, a] * 3 + axis
+    used, place = np.unique(key[voxel, edge], return_inverse=True)
+    ends = np.stack([used // 3, used // 3 + stride[used % 3]], 1)
+    number = np.full((len(base), 12), -1)
+    number[voxel, edge] = place.ravel()
+    part = f[:, a] / np.where(following >= 0, f[:, a] - f[:, b], 1)
+    at = CORNERS[a] + part[..., None] * (CORNERS[b] - CORNERS[a])  # (N, 12, 3)
+
+    # ---------------------- And in the middle of loops ----------------------
+
+    loop, current = np.broadcast_to(np.arange(12), following.shape).copy(), following
+    for _ in range(11):
+        loop = np.where(following >= 0, np.minimum(loop, np.maximum(current, 0)), loop)
+        current = np.take_along_axis(following, np.maximum(current, 0).astype(np.int64), 1)
+    which, middle_of = np.unique(voxel * 12 + loop[voxel, edge], return_inverse=True)
+    middle_of, inside = middle_of.ravel(), which // 12
+    count = np.bincount(middle_of)
+    middle = np.stack([np.bincount(middle_of, at[voxel, edge, k]) / count for k in range(3)], 1)
+    for _ in range(STEPS):
+        value, gradient = _trilinear(f[inside], middle)
+        middle = np.clip(middle - (value / np.maximum((gradient**2).sum(1), 1e-30))[:, None] * gradient, 0, 1)
+    faces = np.stack([number[voxel, edge], number[voxel, after], len(used) + middle_of], 1)
+
+    # ---------------------- How far they are from the surface ----------------------
+
+    p, q, m = at[voxel, edge], at[voxel, after], middle[middle_of]
+    slack = np.zeros(len(used) + len(which))
+    for x in (0.5 * (p + q), 0.5 * (p + m), 0.5 * (q + m), (p + q + m) / 3):
+        value, gradient = _trilinear(f[voxel], x)
+        off = np.abs(value) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30)
+        for k in range(3):
+            np.maximum.at(slack, faces[:, k], np.minimum(off, 1))
+    around = slack[faces].max(1)
+    for k in range(3):
+        np.maximum.at(slack, faces[:, k], around)
+    return Triangles(ends, used % 3, corners[inside], middle, faces.astype(np.uint32), slack)
+
+
+def _uint(numbers: np.ndarray) -> mi.UInt32:
+    """(Not in NumPy's memory, for frozen functions.)"""
+    return mi.UInt32(np.ascontiguousarray(numbers, dtype=np.uint32)) + dr.opaque(mi.UInt32, 0)
+
+
+class SurfaceOfGrid:
+    """The triangles of an `sdfgrid`. What `geometry/meshes.py` asks of a mesh, it answers.
+
+    Rays meet the shape itself: its triangles only tell where edges are.
+
+    inner : the shape.
+    """
+
+    DRJIT_STRUCT = dict.fromkeys(("_ends", "_axis", "_corners", "_middle", "_faces"))  # for `dr.freeze`
+
+    def __init__(self, inner: Any):
+        self.inner = inner
+        self._values: mi.Float | None = None
+        self._triangles: Triangles | None = None
+        self._placed: tuple[list[mi.Float], mi.Float] = ([], mi.Float(0))
+        self._smooth: bool | None = None
+
+    # ---------------------- The triangles, as the values are now ----------------------
+
+    def _renew(self) -> Triangles:
+        """Find the triangles, if the grid is no longer the same. Reads from the device: not in frozen functions."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            assert self._triangles is not None
+            return self._triangles
+        grid = mi.traverse(self.inner)["grid"]
+        values = dr.detach(grid.array)
+        if self._values is not None and values.index == self._values.index:
+            return self._triangles
+        self._values, self.size = values, grid.shape[0]
+        found, before = triangulate(values.numpy().reshape(grid.shape[:3])), self._triangles
+        same = before is not None and before.faces.shape == found.faces.shape and (before.faces == found.faces).all()
+        same = same and before.ends.shape == found.ends.shape and (before.ends == found.ends).all()
+        if not (same and (before.corners == found.corners).all()):
+            self._triangles = found
+            self._ends = [_uint(found.ends[:, k]) for k in (0, 1)]
+            self._axis = _uint(found.axis)
+            self._corners = [_uint(found.corners[:, k]) for k in range(8)]
+            self._middle = [mi.Float(found.middle[:, k].astype(np.float32)) * dr.opaque(mi.Float, 1) for k in range(3)]
+            self._faces = _uint(found.faces.ravel())
+        return self._triangles
+
+    @property
+    def slack(self) -> np.ndarray:
+        """How far about each vertex the triangles are from the surface: (V,), scene units, on the host."""
+        matrix = np.array(dr.detach(mi.traverse(self.inner)["to_world"].matrix), float).reshape(4, 4)[:3, :3]
+        return self._renew().slack * (np.linalg.svd(matrix, compute_uv=False)[0] / (self.size - 1))
+
+    @property
+    def on_faces(self) -> int:
+        """Vertices below this number lie on edges of voxels: lines between two of them, on faces of voxels."""
+        return len(self._renew().ends)
+
+    def _place(self, values: mi.Float, matrix: mi.Matrix4f) -> mi.Float:
+        """The vertices, world space: (3 V,); attached to the values and to `to_world`."""
+        n = self.size
+        cell = lambda i: mi.Vector3f(mi.Float(i % n), mi.Float((i // n) % n), mi.Float(i // (n * n)))
+        at = lambda i: dr.gather(mi.Float, values, i)
+        first, second = (at(e) for e in self._ends)
+        part, base = first / (first - second), cell(self._ends[0])
+        along = [dr.select(self._axis == k, part, 0) for k in range(3)]
+        on_edges = base + mi.Vector3f(*along)
+        if dr.grad_enabled(values) and self._is_smooth():
+            # Outlines follow the normal. (On the edge of a voxel that is nearly tangent to the surface, a place moves
+            # fast.) Creases stay on the faces of voxels; but where normals are smooth, they do not count.
+            with dr.suspend_grad():
+                slope = self._slope(dr.detach(values))
+            off = dr.lerp(first, second, dr.detach(part))
+            on_edges = dr.replace_grad(dr.detach(on_edges), -(off / dr.squared_norm(slope)) * slope)
+        corner = [at(c) for c in self._corners]
+        u = mi.Vector3f(*self._middle)
+        with dr.suspend_grad():
+            for _ in range(2):
+                value, gradient = _value([dr.detach(c) for c in corner], u)
+                u = u - gradient * (value / dr.squared_norm(gradient))
+            gradient = _value([dr.detach(c) for c in corner], u)[1]
+        value = _value(corner, u)[0]
+        u = dr.replace_grad(u, -(value / dr.squared_norm(gradient)) * gradient)
+        inside = cell(self._corners[0]) + u
+        local = [dr.concat([x, y]) / (n - 1) for x, y in zip(on_edges, inside, strict=True)]
+        return dr.ravel(mi.AffineTransform4f(matrix) @ mi.Point3f(*local))
+
+    def _slope(self, values: mi.Float) -> mi.Vector3f:
+        """Mean gradient of the values, by voxels, in the voxels around each vertex that lies on an edge."""
+        n, found = self.size, []
+        first, second = self._ends
+        at = lambda i: dr.gather(mi.Float, values, i)
+        part = at(first) / (at(first) - at(second))
+        for k in range(3):
+            place = (first // n**k) % n
+            up, down = (dr.select(inside, mi.UInt32(1), 0) for inside in (place < n - 1, place > 0))
+            above, below = (dr.lerp(at(first + s), at(second + s), part) for s in (up * n**k, -down * n**k))
+            found.append(dr.select(self._axis == k, at(second) - at(first), (above - below) / mi.Float(up + down)))
+        return mi.Vector3f(*found)
+
+    # ---------------------- What Mitsuba's meshes answer ----------------------
+
+    def vertex_positions_buffer(self) -> mi.Float:
+        self._renew()
+        params = mi.traverse(self.inner)
+        values, matrix = params["grid"].array, params["to_world"].matrix
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return self._place(values, matrix)
+        made_of = [dr.detach(values), *(mi.Float(dr.detach(matrix)[i, j]) for i in range(3) for j in range(4))]
+        held, placed = self._placed
+        if [a.index for a in held] != [a.index for a in made_of]:
+            with dr.suspend_grad():
+                placed = self._place(dr.detach(values), dr.detach(matrix))
+                dr.eval(placed)
+            self._placed = made_of, placed
+        return dr.replace_grad(placed, self._place(values, matrix)) if dr.grad_enabled(values, matrix) else placed
+
+    def vertex_normals_buffer(self) -> mi.Float:
+        """None that differ from those of faces: where smooth normals turn away, they are turned to the viewer."""
+        return dr.zeros(mi.Float, 3 * self.vertex_count())
+
+    def faces_buffer(self) -> mi.UInt32:
+        self._renew()
+        return self._faces
+
+    def vertex_count(self) -> int:
+        found = self._renew()
+        return len(found.ends) + len(found.corners)
+
+    def face_count(self) -> int:
+        return len(self._renew().faces)
+
+    def has_vertex_normals(self) -> bool:
+        return self._is_smooth()
+
+    def has_face_normals(self) -> bool:
+        return not self._is_smooth()
+
+    def has_vertex_texcoords(self) -> bool:
+        return False
+
+    def has_flipped_normals(self) -> bool:
+        return False
+
+    def is_mesh(self) -> bool:
+        return False
+
+    def _is_smooth(self) -> bool:
+        """Do other normals than those of the surface shade it? Mitsuba does not tell, but shows."""
+        if self._smooth is None:
+            with dr.suspend_grad():
+                self._renew()
+                pi = dr.zeros(mi.PreliminaryIntersection3f, len(self._triangles.corners))
+                pi.t, pi.shape, pi.valid = mi.Float(1), mi.ShapePtr(self.inner), mi.Bool(True)
+                params = mi.traverse(self.inner)
+                place = self._place(dr.detach(params["grid"].array), dr.detach(params["to_world"].matrix))
+                p = dr.gather(mi.Point3f, place, self.on_faces + dr.arange(mi.UInt32, dr.width(pi.t)))
+                d = mi.Vector3f(0, 0, 1)
+                si = pi.compute_surface_interaction(mi.Ray3f(p - d, d), mi.RayFlags.All)
+                self._smooth = bool(dr.any(dr.norm(dr.cross(si.n, si.sh_frame.n)) > 1e-4)[0])
+        return self._smooth
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("id", "bbox", "ptr", "bsdf", "class_name", "is_emitter"):
+            return getattr(self.inner, name)
+        raise AttributeError(name)
+
+
+def _value(corner: list[mi.Float], u: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
+    """Trilinear value and gradient at places u of voxels, by voxels."""
+    c, (x, y, z) = corner, u
+    low = [dr.lerp(c[k], c[k + 1], x) for k in (0, 2, 4, 6)]  # at (y, z) = 00, 10, 01, 11
+    dx = [c[k + 1] - c[k] for k in (0, 2, 4, 6)]
+    plane = lambda v: dr.lerp(dr.lerp(v[0], v[1], y), dr.lerp(v[2], v[3], y), z)
+    bottom, top = dr.lerp(low[0], low[1], y), dr.lerp(low[2], low[3], y)
+    dy = dr.lerp(low[1] - low[0], low[3] - low[2], z)
+    return dr.lerp(bottom, top, z), mi.Vector3f(plane(dx), dy, top - bottom)
+
+
+def is_grid(mesh: Any) -> bool:
+    """Do its triangles stand for the surface of a grid, which rays meet in their place?"""
+    return isinstance(mesh, SurfaceOfGrid)
+
+
+def grids_of(geometry: Geometry) -> tuple[SurfaceOfGrid, ...]:
+    return tuple(m for m in geometry.meshes if is_grid(m))
+
+
+def slack_of(geometry: Geometry) -> np.ndarray:
+    """How far about each vertex the surface that is rendered may be from the triangles: (V,), scene units, on the host;
+    0 but for grids."""
+    slack = [m.slack if is_grid(m) else np.zeros(m.vertex_count()) for m in geometry.meshes]
+    return np.concatenate([*slack, np.zeros(geometry.line_vertices)])
+
+
+class Grids:
+    """Finds the grids of a scene, and keeps their triangles, so that frozen functions need not look for them."""
+
+    DRJIT_STRUCT = dict.fromkeys(())  # for `dr.freeze`
+
+    def __init__(self) -> None:
+        self._surfaces: list[SurfaceOfGrid] = []
+
+    def geometry(self, geometry: Geometry) -> Geometry:
+        """The shapes, with the surfaces of grids among the meshes. (Of a grid that is no cube, Mitsuba 3.9 confuses
+        the axes.)"""
+        grids = [s for s in geometry.others if s.class_name() == "SDFGrid" and is_cubic(s)]
+        if not grids:
+            return geometry
+        if [id(s) for s in grids] != [id(s.inner) for s in self._surfaces]:
+            self._surfaces = [SurfaceOfGrid(s) for s in grids]
+        known = {id(s) for s in grids}
+        others = tuple(s for s in geometry.others if id(s) not in known)
+        return replace(geometry, meshes=(*geometry.meshes, *self._surfaces), others=others)
+
+
+def is_cubic(shape: Any) -> bool:
+    return len(set(mi.traverse(shape)["grid"].shape[:3])) == 1
+
+
+# ---------------------- Where rays meet it ----------------------
+
+
+def has_changing_values(shape: Any) -> bool:
+    """Do the values of a grid carry a gradient?"""
+    return dr.grad_enabled(mi.traverse(shape)["grid"].array)
+
+
+def slide_on_grid(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, flags, active) -> None:
+    """Attach where a ray meets the surface of a grid to its values.
+
+    Mitsuba 3.9 takes the length of their gradient for 1 there. But it knows how a point moves along the normal of the
+    surface. The ray meets the surface beside that point, as if another ray met the surface where that stood still.
+    """
+    moved = pi.compute_surface_interaction(dr.detach(ray), flags | mi.RayFlags.FollowShape, active)
+    n = dr.detach(moved.n)
+    t = dr.dot(n, moved.p - ray.o) / dr.dot(n, ray.d)
+    p = ray(t)
+    aside, still = p - moved.p, mi.Ray3f(dr.detach(ray))
+    still.o = dr.replace_grad(still.o, dr.select(active, aside, 0))
+    slid = pi.compute_surface_interaction(still, flags | mi.RayFlags.DetachShape, active)
+    both = lambda a, b: dr.replace_grad(dr.detach(a), (a - dr.detach(a)) + b)
+    si.t, si.p = (dr.select(active, dr.replace_grad(dr.detach(x), y), x) for x, y in ((si.t, t), (si.p, p)))
+    si.n = dr.select(active, both(moved.n, slid.n), si.n)
+    si.sh_frame.n = dr.select(active, both(moved.sh_frame.n, slid.sh_frame.n), si.sh_frame.n)
+    si.initialize_sh_frame()
+    si.wi = dr.select(active, si.to_local(-ray.d), si.wi)
