@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.device_edges import GRID_MET, line_of_sight, rounding
+from rimlight.edge_sampling.geometry.device_edges import line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
 from rimlight.edge_sampling.lights import Lights
@@ -33,7 +33,7 @@ from .tracer import Tracer
 from .veils import is_veil
 
 #: How often the distance is halved in which the outline of a grid is known to be.
-HALVINGS = 4
+HALVINGS = 6
 
 
 @dataclass(frozen=True)
@@ -181,26 +181,27 @@ class FilmBoundary:
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             offset = self._offset(scene, at, p, chosen) * dr.normalize(n_dl)
-            beside, offset = self._on_grid(tracer, at, sensor, chosen, u, p, offset, active)
+            beside, offset, active = self._on_grid(tracer, at, sensor, chosen, found, u, p, offset, active)
             rays, weights = _beside(at, sensor, sampler, beside, offset, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
             active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
-            n_dl = dr.select(active, n_dl * self._sign(at, chosen), 0)
+            n_dl = dr.select(active, n_dl * found.forward, 0)
             shared = self._lune(at, chosen, lights, p, rays, met)
             if tracer.shares_directions:
                 shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
             sensor_moves = at.projection.attached
             return BoundaryPoints(beside, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
 
-    def _on_grid(self, tracer: Tracer, at: Placed, sensor, chosen: Chosen, u, p, offset, active) -> tuple:
+    def _on_grid(self, tracer: Tracer, at: Placed, sensor, chosen: Chosen, found: Found, u, p, offset, active) -> tuple:
         """Where to look at the outline of a grid, or at a crease between its voxels, which are only somewhere between
-        u − offset and u + offset: there, and the offset from there, both by bisection."""
-        edges = self.outlines.edges
+        u − offset and u + offset: there, and the offset from there, both by bisection; and is it there?"""
+        edges, horizons = self.outlines.edges, self.outlines.horizons
         if edges is None or not edges.any_grid:
-            return u, offset
-        active = active & chosen.is_edge & edges.is_of_grid(chosen.edge)
-        outline = self._is_outline_of_grid(at, chosen)
+            return u, offset, active
+        outline = chosen.is_horizon & horizons.is_of_grid(chosen.face)
+        of_grid = outline | (chosen.is_edge & edges.is_of_grid(chosen.edge))
+        searched = active & of_grid
 
         def side(part, active):
             """What is met there: nothing (0), the grid (1), or which of its voxels."""
@@ -209,22 +210,24 @@ class FilmBoundary:
             ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, on_film, lens, active)
             pi = tracer.first_hit(ray, active)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-            met = edges.meets_grid(at.positions, chosen.edge, p, si, outline)
-            return dr.select(met, dr.select(outline, 1, pi.prim_index + 1), 0)
+            voxel = dr.select(edges.meets_grid(at.positions, chosen.edge, p, si), pi.prim_index + 1, 0)
+            surface = horizons.meets_grid(chosen.face, p, found.normal, si)
+            return dr.select(outline, dr.select(surface, mi.UInt32(1), 0), voxel)
 
         one = dr.full(mi.Float, 1, dr.width(u))
-        first = side(-one, active)
-        active &= first != side(one, active)
+        first, last = side(-one, searched), side(one, searched)
+        there = dr.select(outline, (first == 1) & (last == 0), first != last)
+        active, searched = active & (there | ~of_grid), searched & there
 
         def halve(k, low, high):
             middle = 0.5 * (low + high)
-            same = side(middle, active) == first
+            same = side(middle, searched) == first
             return k + 1, dr.select(same, middle, low), dr.select(same, high, middle)
 
         state = (dr.zeros(mi.UInt32, dr.width(u)), -one, one)
-        _, low, high = dr.while_loop(state, lambda k, *_: active & (k < HALVINGS), halve, label="outlines of grids")
-        middle, rest = 0.5 * (low + high), dr.select(active, 0.5 * (high - low), 1)
-        return u + dr.select(active, middle, 0) * offset, rest * offset
+        _, low, high = dr.while_loop(state, lambda k, *_: searched & (k < HALVINGS), halve, label="outlines of grids")
+        middle, rest = 0.5 * (low + high), dr.select(searched, 0.5 * (high - low), 1)
+        return u + dr.select(searched, middle, 0) * offset, rest * offset, active
 
     # ---------------------- What is on their sides ----------------------
 
@@ -268,7 +271,7 @@ class FilmBoundary:
             jumps &= ~(chosen.is_edge & hidden)
         if outlines.horizons is not None:
             dark = outlines.horizons.sees_dark_side(chosen.face, p, rays[0], met[0], chosen.is_horizon)
-            jumps &= ~chosen.is_horizon | dark
+            jumps &= ~chosen.is_horizon | dark | outlines.horizons.is_of_grid(chosen.face)
         if outlines.curves is not None:
             # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
             # that: a jump of the contour's, which would count twice.
@@ -286,39 +289,24 @@ class FilmBoundary:
                     jumps &= ~joined | there | ((sign * faces[0] < 0) & (sign * faces[1] < 0))
         return jumps
 
-    def _sign(self, at: Placed, chosen: Chosen) -> mi.Float:
-        """With which sign the points count, see `OutlinePoint.sign`."""
-        edges = self.outlines.edges
-        if edges is None or not edges.any_grid:
-            return mi.Float(1)
-        back = self._is_outline_of_grid(at, chosen) & edges.is_concave(at.positions, chosen.edge)
-        return dr.select(back, mi.Float(-1), 1)
-
-    def _is_outline_of_grid(self, at: Placed, chosen: Chosen) -> mi.Bool:
-        """Is a point on a silhouette of the surface of a grid?"""
-        edges, projection = self.outlines.edges, at.projection
-        view, eye = projection.view() if projection.orthographic else None, projection.eye(at.aperture_sample)
-        silhouette = edges.is_silhouette(at.positions, chosen.edge, eye, view)
-        return chosen.is_edge & edges.is_of_grid(chosen.edge) & silhouette
-
     def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays) -> list[Horizon | None]:
         """On which side of a horizon of interpolated normals each of two rays is."""
-        edges = self.outlines.edges
-        any_grid = edges is not None and edges.any_grid
-        if self.outlines.horizons is None and not any_grid:
+        horizons = self.outlines.horizons
+        if horizons is None:
             return [None, None]
-        side, reach = mi.Float(0), mi.Float(0)
-        if self.outlines.horizons is not None and edges is not None:
+        side, reach, on_curve = mi.Float(0), mi.Float(0), chosen.is_horizon
+        if self.outlines.edges is not None:
             # Where a curve runs between the two rays beside an edge, its jump is not that of the edge.
             sight = line_of_sight(p, rays)
-            side = self.outlines.edges.facing(at.normals, self.outlines.horizons.sign, chosen.edge, found.t, -sight)
+            side = self.outlines.edges.facing(at.normals, horizons.sign, chosen.edge, found.t, -sight)
             side = dr.select(chosen.is_edge & self.outlines.edges.is_fold(at.positions, chosen.edge, p, sight), side, 0)
-        if any_grid:
+        sides = [dr.select(on_curve, mi.Float(sign), side) for sign in (-1, 1)]
+        if horizons.any_grid:
             # Where smooth normals turn away just inside of an outline, both jumps count as one.
-            outline = self._is_outline_of_grid(at, chosen)
-            side, reach = dr.select(outline, 1, side), dr.select(outline, GRID_MET * edges.slack(chosen.edge), 0)
-        sides = [dr.select(chosen.is_horizon, mi.Float(sign), side) for sign in (-1, 1)]
-        return [Horizon(s, p, chosen.is_horizon, reach) for s in sides]
+            of_grid = on_curve & horizons.is_of_grid(chosen.face)
+            sides, on_curve = [dr.select(of_grid, 1, s) for s in sides], on_curve & ~of_grid
+            reach = dr.select(of_grid, 2 * horizons.window(chosen.face)[0], 0)
+        return [Horizon(s, p, on_curve, reach) for s in sides]
 
     def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart.
@@ -334,6 +322,8 @@ class FilmBoundary:
             to_viewer = mi.Vector3f(viewer) if projection.orthographic else viewer - p
             farther = self.outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)
             in_world += dr.select(chosen.is_edge, farther, 0)
+        if self.outlines.horizons is not None:
+            in_world += dr.select(chosen.is_horizon, self.outlines.horizons.window(chosen.face)[0], 0)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = ulps * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film

@@ -11,7 +11,7 @@ import numpy as np
 from rimlight.edge_sampling.geometry.curves import CurvePoint, Curves
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import EdgeKind, Edges
-from rimlight.edge_sampling.geometry.grids import grids_of, is_grid
+from rimlight.edge_sampling.geometry.grids import grids_of, is_grid, normals
 from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
@@ -70,7 +70,8 @@ class Found:
 
     along_film : mi.Vector2f, tangent on the film, by the fraction that was sampled: pixels. valid : is there one?
     t : parameter on an edge or a cut. eye : from where curves are seen. curve : the points on these.
-    facing : mi.Vector2f, on the film, towards where normals face the viewer.
+    facing : mi.Vector2f, on the film, towards where normals face the viewer; of grids, away from their surface.
+    forward : see `HorizonPoint`. normal : of the surface of a grid.
     """
 
     along_film: mi.Vector2f
@@ -79,6 +80,8 @@ class Found:
     eye: mi.Point3f | None = None
     curve: CurvePoint | None = None
     facing: mi.Vector2f | None = None
+    forward: mi.Float | float = 1.0
+    normal: mi.Vector3f | None = None
 
 
 class FilmOutlines:
@@ -127,7 +130,7 @@ class FilmOutlines:
             Projection(sensor),
             self.geometry.positions(),
             self.curves.frames() if self.curves is not None else None,
-            self.geometry.normals() if self.horizons is not None else None,
+            normals(self.geometry) if self.horizons is not None else None,
         )
 
     def choose(self, lengths: mi.Float, sampler: mi.Sampler, count: int) -> Chosen:
@@ -177,6 +180,10 @@ class FilmOutlines:
             across = lambda v: projection.tangent(h.p, mi.Point3f(h.p + v), mi.Float(0), lens)
             found.along_film = dr.select(chosen.is_horizon, across(h.tangent), found.along_film)
             found.facing = across(h.facing)
+            if self.horizons.any_grid:
+                of_grid = self.horizons.is_of_grid(chosen.face)
+                found.facing = dr.select(of_grid, across(h.normal), found.facing)
+                found.forward, found.normal = dr.select(of_grid, h.forward, 1), h.normal
             found.valid |= chosen.is_horizon & h.valid & (projection.film(h.p).z > projection.near)
         found.valid &= (chosen.density > 0) & dr.isfinite(dr.squared_norm(found.along_film))
         return found
@@ -228,8 +235,9 @@ class FilmOutlines:
             geometry=self.geometry if creases else None,
         )
         if lights is not None:
-            jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights) & ~self.edges.is_of_grid(edge)
-        return jumps
+            jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights)
+        # The outlines of grids are among the horizons.
+        return jumps & (~self.edges.is_of_grid(edge) | self.edges.is_flat(edge))
 
     def visible_lengths(self, at: Placed, lights: mi.Vector4f | None, by_angle: bool) -> mi.Float:
         """Length inside the frame of each edge, cut, horizon and piece of a curve, 0 where nothing can jump: pixels on

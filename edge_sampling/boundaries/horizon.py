@@ -15,6 +15,9 @@ If g has different signs at the corners, c is the one that is alone with its sig
 If not, the curve may still enter and leave through one side: then c is the corner opposite, and s is between the two.
 
 As vertices, normals and viewer move, t follows by one step of Newton's method, whose derivative is exact.
+
+On the triangles that stand for the surface of a grid (`geometry/grids.py`), the same curve is about its outline. There,
+t is held: a point of a smooth surface that is on its outline moves over the film as the outline does.
 """
 
 from __future__ import annotations
@@ -26,7 +29,11 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.grids import is_grid
 from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
+
+#: How far from a point of the outline of a grid its surface is met, in voxels.
+REACH = 4
 
 #: Cosine to the viewer of a normal just beside the horizon.
 BESIDE_HORIZON = 1e-4
@@ -56,12 +63,17 @@ class HorizonPoint:
     p : mi.Point3f, world space; attached to vertices, normals and viewer.
     tangent : mi.Vector3f, dp/ds. Detached.
     facing : mi.Vector3f, towards where normals face the viewer. Detached.
+    normal : mi.Vector3f, that is interpolated there. Detached.
+    forward : mi.Float; −1 where the curve runs back, as seen from the viewer, as seldom: there, the triangles of a grid
+        hide it, and the surface lies on the other side of it than elsewhere.
     valid : mi.Bool, is there one?
     """
 
     p: mi.Point3f
     tangent: mi.Vector3f
     facing: mi.Vector3f
+    normal: mi.Vector3f
+    forward: mi.Float
     valid: mi.Bool
 
 
@@ -74,11 +86,11 @@ class Horizons:
     moving : which of its meshes can move over the film.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("count", "_corners", "sign", "_number"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("count", "_corners", "sign", "_number", "_window", "any_grid"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, moving: np.ndarray):
         self.geometry = geometry
-        smooth = [bool(m) and is_smooth(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
+        smooth = [bool(m) and (is_grid(mesh) or is_smooth(mesh)) for mesh, m in zip(geometry.meshes, moving, strict=False)]
         #: (F, 3), their vertices.
         self.faces = faces = geometry.faces(tuple(smooth))
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
@@ -95,6 +107,14 @@ class Horizons:
         self._number = mi.UInt32(np.concatenate(numbers)) + dr.opaque(mi.UInt32, 0) if meshes else None
         #: Number of faces.
         self.count = len(faces)
+        #: Are there those of grids? Of each vertex, how far from the curve their outline may be, and the size of a
+        #: voxel; 0 of others.
+        self.any_grid = any(is_grid(m) for m in meshes)
+        sizes = [(m.window, m.voxel) if is_grid(m) else (0, 0) for m in geometry.meshes]
+        counts = [m.vertex_count() for m in geometry.meshes]
+        of_vertices = lambda k: [np.broadcast_to(s[k], n) for s, n in zip(sizes, counts, strict=True)]
+        number = lambda a: mi.Float(np.concatenate([*a, np.zeros(geometry.line_vertices)]).astype(np.float32))
+        self._window = [number(of_vertices(k)) * dr.opaque(mi.Float, 1) for k in (0, 1)] if self.any_grid else None
 
     def __len__(self) -> int:
         return self.count
@@ -138,6 +158,8 @@ class Horizons:
     ) -> HorizonPoint:
         """The point u in [0, 1) of the curve in a face. `positions`, `normals` and `eye` may be attached."""
         p, n = self._face(positions, normals, face)
+        with dr.suspend_grad():
+            front = dr.cross(p[1] - p[0], p[2] - p[0])
         p, n, start, end, valid = _arrange(p, n, dr.detach(eye), far)
         s = dr.lerp(start, end, u)
         D, N = dr.lerp(p[1] - p[0], p[2] - p[0], s), dr.lerp(n[1] - n[0], n[2] - n[0], s)
@@ -158,9 +180,35 @@ class Horizons:
             length2 = dr.squared_norm(tangent)
             valid &= (g_t != 0) & dr.isfinite(length2) & (length2 > 0)
             facing = mi.Vector3f(D) * dr.sign(g_t)
+            turns = [dr.dot(dr.cross(tangent, m), v) for m, v in ((normal, view), (front, facing))]
+            forward = dr.sign(turns[0]) * dr.sign(turns[1])
         now = _towards(p[0] + t * D, n[0] + t * N, eye, far)
         follows = t - dr.select(valid, (now - dr.detach(now)) / dr.select(valid, dr.detach(g_t), 1), 0)
-        return HorizonPoint(mi.Point3f(p[0] + follows * D), dr.detach(tangent), dr.detach(facing), valid)
+        if self.any_grid:
+            follows = dr.select(self.is_of_grid(face), t, follows)
+        detached = (dr.detach(v) for v in (tangent, facing, normal, forward))
+        return HorizonPoint(mi.Point3f(p[0] + follows * D), *detached, valid)
+
+    def is_of_grid(self, face: mi.UInt32) -> mi.Bool:
+        """Which faces stand for the surface of a grid?"""
+        return self.window(face)[1] > 0 if self.any_grid else mi.Bool(False)
+
+    def meets_grid(
+        self, face: mi.UInt32, p: mi.Point3f, n: mi.Vector3f, si: mi.SurfaceInteraction3f
+    ) -> mi.Bool:
+        """Does a ray that passes a point of the outline of a grid, with the normal n, meet the surface there?"""
+        window, voxel = self.window(face)
+        aside = dr.abs_dot(dr.normalize(n), si.p - p)
+        return si.is_valid() & (dr.norm(si.p - p) <= REACH * voxel) & (aside <= 2 * window + rounding(p, p))
+
+    def window(self, face: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+        """How far from the curves in faces of grids their outline may be, and the size of a voxel: scene units; 0 for
+        others."""
+        if not self.any_grid:
+            return mi.Float(0), mi.Float(0)
+        corners = [dr.gather(mi.UInt32, c, face) for c in self._corners]
+        largest = lambda of: dr.maximum(*(dr.gather(mi.Float, of, c) for c in corners[:2]))
+        return tuple(dr.maximum(largest(of), dr.gather(mi.Float, of, corners[2])) for of in self._window)
 
     def sees_dark_side(
         self, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active

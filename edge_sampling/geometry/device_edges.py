@@ -185,9 +185,8 @@ class DeviceEdges:
         covered = dr.gather(mi.Bool, self._few_faces, edge) & (covers[0] | covers[1])
         hidden = dr.select(fold, ~(shown[0] & shown[1]), covered & ~(shown[0] | shown[1]))
         if self.any_grid:
-            there = [self.meets_grid(positions, edge, p, si, ~fold) | self._lets_through(si) for si in met]
-            seen = dr.select(fold, there[0] & there[1], there[0] | there[1])
-            hidden = dr.select(self.is_of_grid(edge), ~seen, hidden)
+            there = [self.meets_grid(positions, edge, p, si) | self._lets_through(si) for si in met]
+            hidden = dr.select(self.is_of_grid(edge), ~(fold & there[0] & there[1]), hidden)
         return (
             dr.select(line, self._is_hidden_line(positions, edge, p, rays, met), hidden) if self._any_lines else hidden
         )
@@ -203,16 +202,15 @@ class DeviceEdges:
         return GRID * dr.maximum(dr.gather(mi.Float, self._slack, edge), 0) if self.any_grid else mi.Float(0)
 
     def meets_grid(
-        self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, si: mi.SurfaceInteraction3f, outline: mi.Bool
+        self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, si: mi.SurfaceInteraction3f
     ) -> mi.Bool:
-        """Does a ray meet the surface of a grid beside a point p of an edge? outline : is that a silhouette, from which
-        the surface may be met far away?"""
+        """Does a ray meet the surface of a grid beside a point p of a crease?"""
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         least, met = GRID_MET * self.slack(edge) + rounding(p, p), mi.Bool(False)
         # What is behind an outline may lie in the plane of a face, but it is farther, or another side of it is seen.
         near = dr.norm(si.p - p) <= sum(dr.norm(o - p) for o in self.opposite(positions, edge))
         for n in (first, -second):
-            met |= (dr.abs_dot(n, si.p - p) <= least) & (outline | near & (dr.dot(n, si.n) > ALIKE))
+            met |= (dr.abs_dot(n, si.p - p) <= least) & near & (dr.dot(n, si.n) > ALIKE)
         return self.is_of_grid(edge) & si.is_valid() & met
 
     def is_concave(self, positions: mi.Float, edge: mi.UInt32) -> mi.Bool:
@@ -330,6 +328,10 @@ class DeviceEdges:
     def is_smooth(self, edge: mi.UInt32) -> mi.Bool:
         """Are interpolated normals, and all else, the same on both sides?"""
         return dr.gather(mi.UInt32, self._kind, edge) == int(EdgeKind.SMOOTH)
+
+    def is_flat(self, edge: mi.UInt32) -> mi.Bool:
+        """Are both faces shaded with their own normals?"""
+        return dr.gather(mi.UInt32, self._kind, edge) == int(EdgeKind.FLAT)
 
     def crease(self, edge: mi.UInt32, sine: mi.Float) -> mi.Float:
         """About how much what is seen jumps across an edge, though both of its faces are seen: 1 if something else than

@@ -27,6 +27,10 @@ FACES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (
 #: Edges of a voxel: their corners, in the sense of their axis.
 EDGES = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
 
+#: How far from where smooth normals have it the outline is sought: in voxels, times the angle by which the surface turns
+#: there over one.
+WINDOW = 0.5
+
 #: Steps of Newton's method from the mean of a loop to the surface.
 STEPS = 4
 
@@ -39,6 +43,7 @@ class Triangles:
     corners : (V₂, 8), int64; of the voxels in which the others are. middle : (V₂, 3); where there, from 0 to 1.
     faces : (F, 3), uint32; counter-clockwise, as seen from where values are positive.
     slack : (V,); how far about each vertex the triangles are from the surface, in voxels.
+    bend : (V,); by how much the gradient of the values turns across the voxels about each vertex, in radians.
     """
 
     ends: np.ndarray
@@ -47,6 +52,7 @@ class Triangles:
     middle: np.ndarray
     faces: np.ndarray
     slack: np.ndarray
+    bend: np.ndarray
 
 
 def _next_edges(f: np.ndarray) -> np.ndarray:
@@ -131,10 +137,28 @@ def triangulate(values: np.ndarray) -> Triangles:
         off = np.abs(value) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30)
         for k in range(3):
             np.maximum.at(slack, faces[:, k], np.minimum(off, 1))
-    around = slack[faces].max(1)
+    turn = _turn(values).ravel()[base[voxel]]
+    bend = np.zeros(len(slack))
     for k in range(3):
-        np.maximum.at(slack, faces[:, k], around)
-    return Triangles(ends, used % 3, corners[inside], middle, faces.astype(np.uint32), slack)
+        np.maximum.at(bend, faces[:, k], turn)
+    for most in (slack, bend):
+        around = most[faces].max(1)
+        for k in range(3):
+            np.maximum.at(most, faces[:, k], around)
+    return Triangles(ends, used % 3, corners[inside], middle, faces.astype(np.uint32), slack, bend)
+
+
+def _turn(values: np.ndarray) -> np.ndarray:
+    """By how much the gradient of the values turns across the voxel that begins at each: radians, at most 1. (Inside of
+    a voxel, trilinear values do not tell: along an axis, they are straight.)"""
+    gradient = np.stack(np.gradient(values.astype(np.float64)), 3)
+    n = np.array(values.shape) - 1
+    at = [gradient[z : z + n[0], y : y + n[1], x : x + n[2]] for x, y, z in CORNERS]
+    mean = sum(at) / 8
+    off = np.max([np.linalg.norm(g - mean, axis=3) for g in at], axis=0)
+    turn = np.ones(values.shape)
+    turn[:-1, :-1, :-1] = np.minimum(2 * off / np.maximum(np.linalg.norm(mean, axis=3), 1e-30), 1)
+    return turn
 
 
 def _uint(numbers: np.ndarray) -> mi.UInt32:
@@ -190,6 +214,19 @@ class SurfaceOfGrid:
         return self._renew().slack * (np.linalg.svd(matrix, compute_uv=False)[0] / (self.size - 1))
 
     @property
+    def window(self) -> np.ndarray:
+        """How far from where smooth normals have it the outline may be, about each vertex: (V,), scene units, on the
+        host."""
+        return WINDOW * self.voxel * self._renew().bend
+
+    @property
+    def voxel(self) -> float:
+        """The longest side of a voxel: scene units."""
+        matrix = np.array(dr.detach(mi.traverse(self.inner)["to_world"].matrix), float).reshape(4, 4)[:3, :3]
+        self._renew()
+        return float(np.linalg.norm(matrix, axis=0).max() / (self.size - 1))
+
+    @property
     def on_faces(self) -> int:
         """Vertices below this number lie on edges of voxels: lines between two of them, on faces of voxels."""
         return len(self._renew().ends)
@@ -211,17 +248,23 @@ class SurfaceOfGrid:
             off = dr.lerp(first, second, dr.detach(part))
             on_edges = dr.replace_grad(dr.detach(on_edges), -(off / dr.squared_norm(slope)) * slope)
         corner = [at(c) for c in self._corners]
-        u = mi.Vector3f(*self._middle)
         with dr.suspend_grad():
-            for _ in range(2):
-                value, gradient = _value([dr.detach(c) for c in corner], u)
-                u = u - gradient * (value / dr.squared_norm(gradient))
-            gradient = _value([dr.detach(c) for c in corner], u)[1]
+            held = [dr.detach(c) for c in corner]
+            u = self._onto_surface(held)
+            gradient = _value(held, u)[1]
         value = _value(corner, u)[0]
         u = dr.replace_grad(u, -(value / dr.squared_norm(gradient)) * gradient)
         inside = cell(self._corners[0]) + u
         local = [dr.concat([x, y]) / (n - 1) for x, y in zip(on_edges, inside, strict=True)]
         return dr.ravel(mi.AffineTransform4f(matrix) @ mi.Point3f(*local))
+
+    def _onto_surface(self, corner: list[mi.Float]) -> mi.Vector3f:
+        """Where the vertices in the middle of loops are, in voxels with these values at their corners. Detached."""
+        u = mi.Vector3f(*self._middle)
+        for _ in range(2):
+            value, gradient = _value(corner, u)
+            u = u - gradient * (value / dr.squared_norm(gradient))
+        return u
 
     def _slope(self, values: mi.Float) -> mi.Vector3f:
         """Mean gradient of the values, by voxels, in the voxels around each vertex that lies on an edge."""
@@ -256,6 +299,20 @@ class SurfaceOfGrid:
     def vertex_normals_buffer(self) -> mi.Float:
         """None that differ from those of faces: where smooth normals turn away, they are turned to the viewer."""
         return dr.zeros(mi.Float, 3 * self.vertex_count())
+
+    def gradients(self) -> mi.Float:
+        """Along the normals of the surface, which are the same on all triangles about a vertex: (3 V,), world space.
+        Detached. Of those at vertices on edges of voxels, which have several, the mean over these voxels."""
+        with dr.suspend_grad():
+            self._renew()
+            params = mi.traverse(self.inner)
+            values, to_world = dr.detach(params["grid"].array), dr.detach(params["to_world"])
+            on_edges = self._slope(values)
+            corner = [dr.gather(mi.Float, values, c) for c in self._corners]
+            u = self._onto_surface(corner)
+            inside = _value(corner, u)[1]
+            n = [dr.concat([x, y]) for x, y in zip(on_edges, inside, strict=True)]
+            return dr.ravel(dr.normalize(to_world @ mi.Normal3f(*n)))
 
     def faces_buffer(self) -> mi.UInt32:
         self._renew()
@@ -322,6 +379,19 @@ def is_grid(mesh: Any) -> bool:
 
 def grids_of(geometry: Geometry) -> tuple[SurfaceOfGrid, ...]:
     return tuple(m for m in geometry.meshes if is_grid(m))
+
+
+def normals(geometry: Geometry) -> mi.Float:
+    """As `Geometry.normals`; of grids, those of their surfaces."""
+    if not grids_of(geometry):
+        return geometry.normals()
+    start, parts, known = 0, [], geometry.normals()
+    for m in geometry.meshes:
+        count = 3 * m.vertex_count()
+        own = m.gradients() if is_grid(m) else dr.gather(mi.Float, known, start + dr.arange(mi.UInt32, count))
+        parts.append(own)
+        start += count
+    return dr.concat([*parts, dr.zeros(mi.Float, 3 * geometry.line_vertices)] if geometry.lines else parts)
 
 
 def slack_of(geometry: Geometry) -> np.ndarray:
