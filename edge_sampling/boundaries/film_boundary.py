@@ -27,7 +27,7 @@ from rimlight.edge_sampling.projection.sensors import inside_frame
 
 from .crease import Crease, Directions, LuneOrCrease
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
-from .horizon import Horizon
+from .horizon import BESIDE, Horizon
 from .lune import Lune
 from .tracer import Tracer
 from .veils import is_veil
@@ -211,7 +211,7 @@ class FilmBoundary:
             pi = tracer.first_hit(ray, active)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
             voxel = dr.select(edges.meets_grid(at.positions, chosen.edge, p, si), pi.prim_index + 1, 0)
-            surface = horizons.meets_grid(chosen.face, p, found.normal, si)
+            surface = horizons.meets_grid(chosen.face, p, found.normal, ray, si)
             return dr.select(outline, dr.select(surface, mi.UInt32(1), 0), voxel)
 
         one = dr.full(mi.Float, 1, dr.width(u))
@@ -271,7 +271,12 @@ class FilmBoundary:
             jumps &= ~(chosen.is_edge & hidden)
         if outlines.horizons is not None:
             dark = outlines.horizons.sees_dark_side(chosen.face, p, rays[0], met[0], chosen.is_horizon)
-            jumps &= ~chosen.is_horizon | dark | outlines.horizons.is_of_grid(chosen.face)
+            if outlines.horizons.any_grid:
+                # What was found about the outline of a grid may be that of another part of it, which hides it.
+                si = met[0].compute_surface_interaction(rays[0], mi.RayFlags.Minimal, chosen.is_horizon)
+                own = outlines.horizons.meets_grid(chosen.face, p, found.normal, rays[0], si, before=BESIDE)
+                dark = dr.select(outlines.horizons.is_of_grid(chosen.face), own, dark)
+            jumps &= ~chosen.is_horizon | dark
         if outlines.curves is not None:
             # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
             # that: a jump of the contour's, which would count twice.

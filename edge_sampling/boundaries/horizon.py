@@ -32,8 +32,11 @@ from rimlight.edge_sampling.geometry.device_edges import rounding
 from rimlight.edge_sampling.geometry.grids import is_grid
 from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
 
-#: How far from a point of the outline of a grid its surface is met, in voxels.
-REACH = 4
+#: How far before and behind a point near the outline of a grid its surface is met, in voxels.
+REACH = 12, 0.75
+
+#: And just beside its outline: how far before.
+BESIDE = 1.0
 
 #: Cosine to the viewer of a normal just beside the horizon.
 BESIDE_HORIZON = 1e-4
@@ -194,12 +197,14 @@ class Horizons:
         return self.window(face)[1] > 0 if self.any_grid else mi.Bool(False)
 
     def meets_grid(
-        self, face: mi.UInt32, p: mi.Point3f, n: mi.Vector3f, si: mi.SurfaceInteraction3f
+        self, face: mi.UInt32, p: mi.Point3f, n: mi.Vector3f, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, before=REACH[0]
     ) -> mi.Bool:
-        """Does a ray that passes a point of the outline of a grid, with the normal n, meet the surface there?"""
+        """Does a ray that passes a point p of the outline of a grid, with the normal n, meet the surface before it, or
+        there? What is met behind it is hidden by what ends at the outline."""
         window, voxel = self.window(face)
-        aside = dr.abs_dot(dr.normalize(n), si.p - p)
-        return si.is_valid() & (dr.norm(si.p - p) <= REACH * voxel) & (aside <= 2 * window + rounding(p, p))
+        aside, behind = dr.abs_dot(dr.normalize(n), si.p - p), dr.dot(si.p - p, ray.d)
+        near = (behind >= -before * voxel) & (behind <= REACH[1] * voxel)
+        return si.is_valid() & near & (aside <= 2 * window + rounding(p, p))
 
     def window(self, face: mi.UInt32) -> tuple[mi.Float, mi.Float]:
         """How far from the curves in faces of grids their outline may be, and the size of a voxel: scene units; 0 for
