@@ -33,10 +33,10 @@ from rimlight.edge_sampling.geometry.grids import is_grid
 from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
 
 #: How far before and behind a point near the outline of a grid its surface is met, in voxels.
-REACH = 12, 0.75
+REACH = 12, 1.25
 
 #: And just beside its outline: how far before.
-BESIDE = 1.0
+BESIDE = 2.0
 
 #: Cosine to the viewer of a normal just beside the horizon.
 BESIDE_HORIZON = 1e-4
