@@ -8,7 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from building import camera, diffuse, horizontal, light, quad, scene
+from building import camera, diffuse, film, horizontal, light, quad, scene
 
 LOOK = ((0.9, 1.7, -3.0), (0, 0.45, 0))
 
@@ -42,11 +42,11 @@ def lamp(kind: str) -> dict[str, Any]:
     return {"lamp": horizontal((0.9, 2.6, -0.9), 0.5, "lamp", down=True, bsdf=off, emitter=light(10, 9, 8))}
 
 
-def on_floor(normals: str = "smooth", n: int = 64, lit: str = "area") -> mi.Scene:
+def on_floor(normals: str = "smooth", n: int = 64, lit: str = "area", rfilter: str = "box") -> mi.Scene:
     """It floats above a floor, before a wall."""
     floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5, 0.6, 0.7, two_sided=True))
     wall = quad((-1.5, 0, 1.2), (0, 1.6, 0), (3, 0, 0), "wall", bsdf=diffuse(0.7, 0.5, 0.4, two_sided=True))
-    return scene(sensor=camera(*LOOK), thing=grid(normals, n), floor=floor, wall=wall, **lamp(lit))
+    return scene(sensor=camera(*LOOK, film=film(rfilter)), thing=grid(normals, n), floor=floor, wall=wall, **lamp(lit))
 
 
 def bump(n: int = 64) -> list[float]:
@@ -63,6 +63,8 @@ LAMP = {"key": "lamp.vertex_positions", "direction": [1, 0, 0.5]}
 #: Of each case: scene, motion, step, max_depth.
 GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_slides": (on_floor, SLIDES, 6e-3, 2),
+    "grid_slides_gaussian": (partial(on_floor, rfilter="gaussian"), SLIDES, 6e-3, 2),
+    "grid_slides_indirect": (on_floor, SLIDES, 6e-3, 3),
     "grid_grows": (on_floor, GROWS, 4e-3, 2),
     "grid_lamp": (on_floor, LAMP, 1e-2, 2),
     "grid_slides_in_hard_light": (partial(on_floor, lit="point"), SLIDES, 6e-3, 2),

@@ -93,7 +93,8 @@ class Horizons:
 
     def __init__(self, geometry: Geometry, moving: np.ndarray):
         self.geometry = geometry
-        smooth = [bool(m) and (is_grid(mesh) or is_smooth(mesh)) for mesh, m in zip(geometry.meshes, moving, strict=False)]
+        has_curves = lambda mesh: is_grid(mesh) or is_smooth(mesh)
+        smooth = [bool(m) and has_curves(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
         #: (F, 3), their vertices.
         self.faces = faces = geometry.faces(tuple(smooth))
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
@@ -197,10 +198,16 @@ class Horizons:
         return self.window(face)[1] > 0 if self.any_grid else mi.Bool(False)
 
     def meets_grid(
-        self, face: mi.UInt32, p: mi.Point3f, n: mi.Vector3f, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, before=REACH[0]
+        self,
+        face: mi.UInt32,
+        p: mi.Point3f,
+        n: mi.Vector3f,
+        ray: mi.Ray3f,
+        si: mi.SurfaceInteraction3f,
+        before: float = REACH[0],
     ) -> mi.Bool:
-        """Does a ray that passes a point p of the outline of a grid, with the normal n, meet the surface before it, or
-        there? What is met behind it is hidden by what ends at the outline."""
+        """Does a ray that passes a point p of the outline of a grid, with the normal n, meet the surface there, or
+        before it, at most so many voxels? What is farther behind p is hidden by what ends at the outline."""
         window, voxel = self.window(face)
         aside, behind = dr.abs_dot(dr.normalize(n), si.p - p), dr.dot(si.p - p, ray.d)
         near = (behind >= -before * voxel) & (behind <= REACH[1] * voxel)

@@ -201,9 +201,7 @@ class DeviceEdges:
         """How far from edges what is rendered may lie: scene units; 0 but for grids."""
         return GRID * dr.maximum(dr.gather(mi.Float, self._slack, edge), 0) if self.any_grid else mi.Float(0)
 
-    def meets_grid(
-        self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, si: mi.SurfaceInteraction3f
-    ) -> mi.Bool:
+    def meets_grid(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Does a ray meet the surface of a grid beside a point p of a crease?"""
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         least, met = GRID_MET * self.slack(edge) + rounding(p, p), mi.Bool(False)

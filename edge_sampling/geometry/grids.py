@@ -27,8 +27,8 @@ FACES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (
 #: Edges of a voxel: their corners, in the sense of their axis.
 EDGES = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
 
-#: How far from where smooth normals have it the outline is sought: in voxels, times the angle by which the surface turns
-#: there over one.
+#: How far from where smooth normals have it the outline is sought: in voxels, times the angle by which the surface
+#: turns there over one.
 WINDOW = 0.5
 
 #: Steps of Newton's method from the mean of a loop to the surface.
