@@ -926,7 +926,10 @@ CASES = [
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=4096 if k.endswith("_slides") else 1024)
         for k, (*of, depth) in (INSTANCES | CURVES | JOINTS).items()
     ),
-    *(Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096) for k, (*of, depth) in GRIDS.items()),
+    *(
+        Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096 if k == "grid_slides" else 1024)
+        for k, (*of, depth) in GRIDS.items()
+    ),
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
         for k, of in HIDDEN.items()

@@ -26,9 +26,19 @@ def distances(n: int) -> np.ndarray:
     return torus * (1 - h) + ball * h - 0.2 * h * (1 - h)
 
 
-def grid(normals: str = "smooth", n: int = 64, bsdf: dict | None = None) -> dict[str, Any]:
+def torus(n: int) -> np.ndarray:
+    """Its axis is one of the grid, as are its planes of symmetry."""
+    x = np.linspace(-1, 1, n)
+    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+    return np.hypot(np.hypot(x, z) - 0.55, y) - 0.25
+
+
+def grid(
+    normals: str = "smooth", n: int = 64, bsdf: dict | None = None, values: np.ndarray | None = None
+) -> dict[str, Any]:
     to_world = mi.ScalarTransform4f().translate([-SIDE / 2, -0.2, -SIDE / 2]).scale(SIDE)
-    values = mi.TensorXf(distances(n)[..., None].astype(np.float32))
+    values = distances(n) if values is None else values
+    values = mi.TensorXf(values[..., None].astype(np.float32))
     bsdf = bsdf or diffuse(0.8, 0.5, 0.3, two_sided=True)
     return {"type": "sdfgrid", "normals": normals, "grid": values, "to_world": to_world, "bsdf": bsdf}
 
@@ -49,6 +59,12 @@ def on_floor(normals: str = "smooth", n: int = 64, lit: str = "area", rfilter: s
     return scene(sensor=camera(*LOOK, film=film(rfilter)), thing=grid(normals, n), floor=floor, wall=wall, **lamp(lit))
 
 
+def along_axis() -> mi.Scene:
+    """A black torus before a bright sky, seen along an axis of its grid, where much of its surface is seen edge-on."""
+    sensor = camera((0, SIDE / 2 - 0.2, -3.2), (0, SIDE / 2 - 0.2, 0))
+    return scene(sensor=sensor, thing=grid(bsdf=diffuse(0.0, two_sided=True), values=torus(64)), **lamp("sky"))
+
+
 def bump(n: int = 64) -> list[float]:
     """A motion of the values that is not the same everywhere."""
     x = np.linspace(-1, 1, n)
@@ -64,6 +80,7 @@ LAMP = {"key": "lamp.vertex_positions", "direction": [1, 0, 0.5]}
 GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_slides": (on_floor, SLIDES, 6e-3, 2),
     "grid_slides_gaussian": (partial(on_floor, rfilter="gaussian"), SLIDES, 6e-3, 2),
+    "grid_along_axis": (along_axis, SLIDES, 6e-3, 2),
     "grid_slides_indirect": (on_floor, SLIDES, 6e-3, 3),
     "grid_grows": (on_floor, GROWS, 4e-3, 2),
     "grid_lamp": (on_floor, LAMP, 1e-2, 2),

@@ -361,8 +361,8 @@ MUTANTS = [
     mutant(
         "edges from points: only what is seen past silhouettes counts",
         SHADING,
-        "return faces * (edge - turned) - side",
-        "return -side",
+        "(faces * (edge - turned) - side",
+        "(-side",
     ),
     # ---------------------- Channels besides light ----------------------
     mutant(
