@@ -21,6 +21,7 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
+from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP
@@ -243,6 +244,13 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
         limits.append(
             f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid), which are not "
             "known: give the grid as many values along each axis as along the others."
+        )
+    hard = any(e.flags() & mi.EmitterFlags.Delta or hasattr(e, "light_count") for e in scene.emitters())
+    smooth = names(g.inner for g in grids_of(geometry) if g.has_vertex_normals()) if hard and moving.anything else []
+    if smooth:
+        limits.append(
+            f"the derivative is off by some per cent where {', '.join(smooth)} (sdfgrid with smooth normals) turn away "
+            "from lights without a size: at the shadow that they throw on themselves."
         )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:
