@@ -236,8 +236,10 @@ class FilmOutlines:
         )
         if lights is not None:
             jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights)
-        # The outlines of grids are among the horizons.
-        return jumps & (~self.edges.is_of_grid(edge) | self.edges.is_flat(edge))
+        if self.edges.any_grid:
+            # The outlines of grids are among the horizons.
+            jumps &= ~self.edges.is_of_grid(edge) | self.edges.is_flat(edge)
+        return jumps
 
     def visible_lengths(self, at: Placed, lights: mi.Vector4f | None, by_angle: bool) -> mi.Float:
         """Length inside the frame of each edge, cut, horizon and piece of a curve, 0 where nothing can jump: pixels on

@@ -310,7 +310,7 @@ class DeviceEdges:
         margin, most = BESIDE_LINE
         corner = dr.select(of(self._few_faces), dr.select(inside & (sharp > 0), dr.minimum(sharp, most), 0), most)
         farther += dr.select(of(self._is_line), 0, margin * corner * lift(scene, p))
-        farther += self.slack(edge)
+        farther += self.slack(edge) if self.any_grid else 0
         return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
 
     def _overhang(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:

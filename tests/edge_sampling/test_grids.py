@@ -12,7 +12,8 @@ import pytest
 from both_modes import assert_backward_is_forward
 
 from rimlight.checks import Motion, derivative_image
-from rimlight.edge_sampling.geometry.grids import SurfaceOfGrid, triangulate
+from rimlight.edge_sampling.geometry.grid_triangles import triangulate
+from rimlight.edge_sampling.geometry.grids import SurfaceOfGrid
 
 
 def ball(n: int, radius: float = 0.7) -> np.ndarray:
