@@ -85,6 +85,5 @@ GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_grows": (on_floor, GROWS, 4e-3, 2),
     "grid_lamp": (on_floor, LAMP, 1e-2, 2),
     "grid_slides_in_hard_light": (partial(on_floor, lit="point"), SLIDES, 6e-3, 2),
-    "grid_of_flat_normals": (partial(on_floor, "analytic"), SLIDES, 6e-3, 2),
     "grid_deforms": (partial(on_floor, "analytic"), {"key": "thing.grid", "direction": bump()}, 4e-3, 2),
 }

@@ -246,11 +246,11 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             "known: give the grid as many values along each axis as along the others."
         )
     hard = any(e.flags() & mi.EmitterFlags.Delta or hasattr(e, "light_count") for e in scene.emitters())
-    smooth = names(g.inner for g in grids_of(geometry) if g.has_vertex_normals()) if hard and moving.anything else []
-    if smooth:
+    shaded = names(g.inner for g in grids_of(geometry) if moving.anything and (hard or not g.has_vertex_normals()))
+    if shaded:
         limits.append(
-            f"the derivative is off by some per cent where {', '.join(smooth)} (sdfgrid with smooth normals) turn away "
-            "from lights without a size: at the shadow that they throw on themselves."
+            f"the derivative is off by up to a tenth in parts of the shading of {', '.join(shaded)} (sdfgrid): with "
+            "analytic normals; and in lights without a size, at the shadow that it throws on itself."
         )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:
