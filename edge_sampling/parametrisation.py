@@ -33,6 +33,7 @@ interpolated normals: what slides over such a mesh jumps at the edges of its fac
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import drjit as dr
 import mitsuba as mi
@@ -151,14 +152,24 @@ def flush(x: mi.SurfaceInteraction3f, y: mi.SurfaceInteraction3f) -> mi.Bool:
     return in_plane(x, y.p) | in_plane(y, x.p)
 
 
-def in_plane(x: mi.SurfaceInteraction3f, p: mi.Point3f) -> mi.Bool:
-    """Does a point lie in the tangent plane at x, as far as single precision can tell?"""
+def in_plane(x: mi.SurfaceInteraction3f, p: mi.Point3f, slack: mi.Float | float = 0.0) -> mi.Bool:
+    """Does a point lie in the tangent plane at x, as far as single precision can tell? slack : how far off, besides."""
     with dr.suspend_grad():
         scale = dr.max(dr.maximum(dr.abs(x.p), dr.abs(p)))
-        return dr.abs_dot(x.n, p - x.p) <= FLUSH * dr.epsilon(mi.Float) * scale
+        return dr.abs_dot(x.n, p - x.p) <= FLUSH * dr.epsilon(mi.Float) * scale + slack
 
 
 # ---------------------- Vicinity ----------------------
+
+
+class Slides(Enum):
+    """What else slides than what is close to the vertex before: nothing; what rough glass shows; everything. (Where the
+    values of a grid change, its points move across its surface only, and in another way on each side of a crease: of
+    all points that are held, these alone are not to be told.)"""
+
+    NOTHING = 0
+    BEHIND_GLASS = 1
+    EVERYTHING = 2
 
 
 @dataclass(frozen=True)
@@ -173,9 +184,10 @@ class Vicinity:
     glass: bool = False
 
     @staticmethod
-    def of(first: mi.PreliminaryIntersection3f, glass: bool = False) -> Vicinity:
+    def of(first: mi.PreliminaryIntersection3f, slides: Slides = Slides.NOTHING) -> Vicinity:
         """That of the paths which meet their first vertex there."""
-        return Vicinity(dr.select(first.is_valid(), VICINITY * first.t, 0), glass)
+        radius = mi.Float(dr.inf) if slides is Slides.EVERYTHING else VICINITY * first.t
+        return Vicinity(dr.select(first.is_valid(), radius, 0), slides is Slides.BEHIND_GLASS)
 
     def around(self, bsdf: mi.BSDFPtr) -> Vicinity:
         """That of a vertex on a surface with this BSDF."""
@@ -358,7 +370,11 @@ class Parametrisation:
     def __init__(self, scene: mi.Scene):
         self.scene = scene
         moving = [s for s in scene.shapes() if s.parameters_grad_enabled()]
-        self.moving = [(mi.ShapePtr(s), s.is_mesh() or s.class_name() == "Instance") for s in moving]
+        self.moving = [
+            (mi.ShapePtr(s), s.is_mesh() or s.class_name() == "Instance") for s in moving if s.class_name() != "SDFGrid"
+        ]
+        #: Grids, whose parametrisation has no derivatives in Mitsuba.
+        self.grids = [s for s in moving if s.class_name() == "SDFGrid"]
         self.any_curved = any(not s.is_mesh() for s in scene.shapes())
         self.smooth_lamps = SmoothLamps(scene)
 
@@ -379,6 +395,8 @@ class Parametrisation:
         geometry = cos / r2
         if self.moving:
             geometry *= self._area(pi, ray, active)
+        for shape in self.grids:
+            geometry *= _area_of_grid(shape, pi, y, active)
         geometry = _relative(geometry)
         still = active & flush(si, y)
         fixed = still | grazes(y, ω, active) if self.any_curved else still
@@ -404,6 +422,14 @@ class Parametrisation:
             return area
         si = material_point(ray, pi, on_other, mi.RayFlags.dPdUV)
         return dr.select(on_other, dr.norm(dr.cross(si.dp_du, si.dp_dv)), area)
+
+
+def _area_of_grid(shape: mi.Shape, pi: mi.PreliminaryIntersection3f, y: mi.SurfaceInteraction3f, active) -> mi.Float:
+    """What an area element at y on a grid is proportional to, attached to `to_world`; 1 where y is on another shape."""
+    to_world = mi.traverse(shape)["to_world"]
+    to_local = dr.detach(to_world).inverse()
+    u, v = (to_world @ (to_local @ w) for w in mi.coordinate_system(dr.detach(y.n)))
+    return dr.select(active & (pi.shape == mi.ShapePtr(shape)), dr.norm(dr.cross(u, v)), 1)
 
 
 def _relative(x: mi.Float) -> mi.Float:

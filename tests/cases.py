@@ -30,6 +30,7 @@ from building import (
     scene,
 )
 from cuts import CURVES, CUTS
+from grids import GRIDS
 from hidden_lights import HIDDEN
 from instances import INSTANCES
 from joints import JOINTS
@@ -927,6 +928,10 @@ CASES = [
         for k, (*of, depth) in (INSTANCES | CURVES | JOINTS).items()
     ),
     *(Case(k, *of, spp=64, runs=12, integrator=kind, reference_spp=4096) for k, (*of, kind) in AS_WRITTEN.items()),
+    *(
+        Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096 if k == "grid_slides" else 1024)
+        for k, (*of, depth) in GRIDS.items()
+    ),
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
         for k, of in HIDDEN.items()

@@ -343,8 +343,14 @@ MUTANTS = [
     mutant(
         "narrow lobes: edges at points do not know how they turn, where light is scattered more than once",
         REPLAY,
-        "dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(here), later))",
-        "dr.set_grad(leaf, dr.select(at_first & (leaf is not self.leaves[3]), mi.Vector3f(here), later))",
+        "dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(δ), later))",
+        "dr.set_grad(leaf, dr.select(at_first & (leaf is not self.leaves[3]), mi.Vector3f(δ), later))",
+    ),
+    mutant(
+        "narrow lobes: edges at further vertices do not know how they turn",
+        REPLAY,
+        "return [p, n, d, axis]",
+        "return [p, n, d, mi.Vector3f(zero)]",
     ),
     mutant(
         "vicinity: edges behind rough glass count on one side",
@@ -361,8 +367,8 @@ MUTANTS = [
     mutant(
         "edges from points: only what is seen past silhouettes counts",
         SHADING,
-        "return faces * (edge - turned) - side",
-        "return -side",
+        "(faces * (edge - turned) - side",
+        "(-side",
     ),
     # ---------------------- Channels besides light ----------------------
     mutant(

@@ -100,7 +100,7 @@ class DeepShadows(ShadowBoundary):
             p = self.silhouettes.point(placement, edge.sample, light.y).p
             of_edge = turning(edge.lit, p - held, active)
             of_y = turning(edge.lit, material_point(ray, pi, active).p - held, active)
-            return -L * (of_edge - beyond * of_y)
+            return -edge.sign * L * (of_edge - beyond * of_y)
 
     def _edge_from(self, placement, sender, choice, time, sampler) -> tuple[LightPoint, LitEdge]:
         """An edge as the sender of the light sees it."""

@@ -27,10 +27,13 @@ from rimlight.edge_sampling.projection.sensors import inside_frame
 
 from .crease import Crease, Directions, LuneOrCrease
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
-from .horizon import Horizon
+from .horizon import BESIDE, Horizon
 from .lune import Lune
 from .tracer import Tracer
 from .veils import is_veil
+
+#: How often the distance is halved in which the outline of a grid is known to be.
+HALVINGS = 6
 
 
 @dataclass(frozen=True)
@@ -180,16 +183,53 @@ class FilmBoundary:
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             offset = self._offset(scene, at, p, chosen) * dr.normalize(n_dl)
-            rays, weights = _beside(at, sensor, sampler, u, offset, active)
+            beside, offset, active = self._on_grid(tracer, at, sensor, chosen, found, u, p, offset, active)
+            rays, weights = _beside(at, sensor, sampler, beside, offset, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
             active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
-            n_dl = dr.select(active, n_dl, 0)
+            n_dl = dr.select(active, n_dl * found.forward, 0)
             shared = self._lune(at, chosen, lights, p, rays, met)
             if tracer.shares_directions:
                 shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
             sensor_moves = at.projection.attached
-            return BoundaryPoints(u, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
+            return BoundaryPoints(beside, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
+
+    def _on_grid(self, tracer: Tracer, at: Placed, sensor, chosen: Chosen, found: Found, u, p, offset, active) -> tuple:
+        """Where to look at the outline of a grid, or at a crease between its voxels, which are only somewhere between
+        u − offset and u + offset: there, and the offset from there, both by bisection; and is it there?"""
+        edges, horizons = self.outlines.edges, self.outlines.horizons
+        if edges is None or not edges.any_grid:
+            return u, offset, active
+        outline = chosen.is_horizon & horizons.is_of_grid(chosen.face)
+        of_grid = outline | (chosen.is_edge & edges.is_of_grid(chosen.edge))
+        searched = active & of_grid
+
+        def side(part, active):
+            """What is met there: nothing (0), the grid (1), or which of its voxels."""
+            lens = mi.Point2f(0.5) if at.aperture_sample is None else at.aperture_sample
+            on_film = (u + part * offset - at.projection.crop_offset) / at.projection.crop_size
+            ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, on_film, lens, active)
+            pi = tracer.first_hit(ray, active)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+            voxel = dr.select(edges.meets_grid(at.positions, chosen.edge, p, si), pi.prim_index + 1, 0)
+            surface = horizons.meets_grid(chosen.face, p, found.normal, ray, si)
+            return dr.select(outline, dr.select(surface, mi.UInt32(1), 0), voxel)
+
+        one = dr.full(mi.Float, 1, dr.width(u))
+        first, last = side(-one, searched), side(one, searched)
+        there = dr.select(outline, (first == 1) & (last == 0), first != last)
+        active, searched = active & (there | ~of_grid), searched & there
+
+        def halve(k, low, high):
+            middle = 0.5 * (low + high)
+            same = side(middle, searched) == first
+            return k + 1, dr.select(same, middle, low), dr.select(same, high, middle)
+
+        state = (dr.zeros(mi.UInt32, dr.width(u)), -one, one)
+        _, low, high = dr.while_loop(state, lambda k, *_: searched & (k < HALVINGS), halve, label="outlines of grids")
+        middle, rest = 0.5 * (low + high), dr.select(searched, 0.5 * (high - low), 1)
+        return u + dr.select(searched, middle, 0) * offset, rest * offset, active
 
     # ---------------------- What is on their sides ----------------------
 
@@ -233,6 +273,11 @@ class FilmBoundary:
             jumps &= ~(chosen.is_edge & hidden)
         if outlines.horizons is not None:
             dark = outlines.horizons.sees_dark_side(chosen.face, p, rays[0], met[0], chosen.is_horizon)
+            if outlines.horizons.any_grid:
+                # What was found about the outline of a grid may be that of another part of it, which hides it.
+                si = met[0].compute_surface_interaction(rays[0], mi.RayFlags.Minimal, chosen.is_horizon)
+                own = outlines.horizons.meets_grid(chosen.face, p, found.normal, rays[0], si, before=BESIDE)
+                dark = dr.select(outlines.horizons.is_of_grid(chosen.face), own, dark)
             jumps &= ~chosen.is_horizon | dark
         if outlines.curves is not None:
             # Where a rim of a cylinder comes close to its contour, the ray on the side of the wall may pass beyond
@@ -253,15 +298,22 @@ class FilmBoundary:
 
     def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays) -> list[Horizon | None]:
         """On which side of a horizon of interpolated normals each of two rays is."""
-        if self.outlines.horizons is None:
+        horizons = self.outlines.horizons
+        if horizons is None:
             return [None, None]
-        side = mi.Float(0)
+        side, reach, on_curve = mi.Float(0), mi.Float(0), chosen.is_horizon
         if self.outlines.edges is not None:
             # Where a curve runs between the two rays beside an edge, its jump is not that of the edge.
             sight = line_of_sight(p, rays)
-            side = self.outlines.edges.facing(at.normals, self.outlines.horizons.sign, chosen.edge, found.t, -sight)
+            side = self.outlines.edges.facing(at.normals, horizons.sign, chosen.edge, found.t, -sight)
             side = dr.select(chosen.is_edge & self.outlines.edges.is_fold(at.positions, chosen.edge, p, sight), side, 0)
-        return [Horizon(dr.select(chosen.is_horizon, mi.Float(sign), side), p, chosen.is_horizon) for sign in (-1, 1)]
+        sides = [dr.select(on_curve, mi.Float(sign), side) for sign in (-1, 1)]
+        if horizons.any_grid:
+            # Where smooth normals turn away just inside of an outline, both jumps count as one.
+            of_grid = on_curve & horizons.is_of_grid(chosen.face)
+            sides, on_curve = [dr.select(of_grid, 1, s) for s in sides], on_curve & ~of_grid
+            reach = dr.select(of_grid, 2 * horizons.window(chosen.face)[0], 0)
+        return [Horizon(s, p, on_curve, reach) for s in sides]
 
     def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> mi.Float:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart.
@@ -277,6 +329,8 @@ class FilmBoundary:
             to_viewer = mi.Vector3f(viewer) if projection.orthographic else viewer - p
             farther = self.outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)
             in_world += dr.select(chosen.is_edge, farther, 0)
+        if self.outlines.horizons is not None:
+            in_world += dr.select(chosen.is_horizon, self.outlines.horizons.window(chosen.face)[0], 0)
         in_world *= projection.pixels_per_unit(projection.film(p))
         on_film = ulps * max(projection.crop_size + projection.crop_offset)
         return in_world + on_film

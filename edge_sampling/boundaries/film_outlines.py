@@ -11,6 +11,7 @@ import numpy as np
 from rimlight.edge_sampling.geometry.curves import CurvePoint, Curves
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import EdgeKind, Edges
+from rimlight.edge_sampling.geometry.grids import grids_of, is_grid, normals
 from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import Projection
@@ -69,7 +70,8 @@ class Found:
 
     along_film : mi.Vector2f, tangent on the film, by the fraction that was sampled: pixels. valid : is there one?
     t : parameter on an edge or a cut. eye : from where curves are seen. curve : the points on these.
-    facing : mi.Vector2f, on the film, towards where normals face the viewer.
+    facing : mi.Vector2f, on the film, towards where normals face the viewer; of grids, away from their surface.
+    forward : see `HorizonPoint`. normal : of the surface of a grid.
     """
 
     along_film: mi.Vector2f
@@ -78,6 +80,8 @@ class Found:
     eye: mi.Point3f | None = None
     curve: CurvePoint | None = None
     facing: mi.Vector2f | None = None
+    forward: mi.Float | float = 1.0
+    normal: mi.Vector3f | None = None
 
 
 class FilmOutlines:
@@ -89,7 +93,7 @@ class FilmOutlines:
     geometry, edges, moving, turning, soft, seams : see `FilmBoundary`.
     """
 
-    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "lines")
+    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "lines", "grids")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
     def __init__(
@@ -103,17 +107,18 @@ class FilmOutlines:
         seams: bool,
     ):
         self.geometry, self.soft = geometry, soft
-        self.lines = geometry.lines
+        self.lines, self.grids = geometry.lines, grids_of(geometry)
         edges, faces = edges.of_meshes(moving, lines=geometry.any_line(moving)), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays: if curves alone move, one face without area stands for all.)
         faces = faces if len(faces) else np.zeros((1, 3), np.uint32)
         self.edges = DeviceEdges(edges, geometry) if len(edges) else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
         #: Which edges are on meshes that reflect light from all directions, but from behind?
-        spread = np.array([m.bsdf() is not None and spreads(m.bsdf()) for m in geometry.meshes] or [False])
+        known = [m.bsdf() if not is_grid(m) else None for m in geometry.meshes]
+        spread = np.array([bsdf is not None and spreads(bsdf) for bsdf in known] or [False])
         self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
         #: And which on meshes that are matt? None where these have few creases, and there is little to gain.
-        matt = np.array([m.bsdf() is not None and is_matt(m.bsdf()) for m in geometry.meshes] or [False])
+        matt = np.array([bsdf is not None and is_matt(bsdf) for bsdf in known] or [False])
         matt = matt[edges.mesh].all(1)
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
@@ -134,7 +139,7 @@ class FilmOutlines:
             Projection(sensor),
             self.geometry.positions(),
             self.curves.frames() if self.curves is not None else None,
-            self.geometry.normals() if self.horizons is not None else None,
+            normals(self.geometry) if self.horizons is not None else None,
         )
 
     def choose(self, lengths: mi.Float, sampler: mi.Sampler, count: int) -> Chosen:
@@ -184,6 +189,10 @@ class FilmOutlines:
             across = lambda v: projection.tangent(h.p, mi.Point3f(h.p + v), mi.Float(0), lens)
             found.along_film = dr.select(chosen.is_horizon, across(h.tangent), found.along_film)
             found.facing = across(h.facing)
+            if self.horizons.any_grid:
+                of_grid = self.horizons.is_of_grid(chosen.face)
+                found.facing = dr.select(of_grid, across(h.normal), found.facing)
+                found.forward, found.normal = dr.select(of_grid, h.forward, 1), h.normal
             found.valid |= chosen.is_horizon & h.valid & (projection.film(h.p).z > projection.near)
         found.valid &= (chosen.density > 0) & dr.isfinite(dr.squared_norm(found.along_film))
         return found
@@ -236,6 +245,9 @@ class FilmOutlines:
         )
         if lights is not None:
             jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights)
+        if self.edges.any_grid:
+            # The outlines of grids are among the horizons.
+            jumps &= ~self.edges.is_of_grid(edge) | self.edges.is_flat(edge)
         return jumps
 
     def visible_lengths(self, at: Placed, lights: mi.Vector4f | None, by_angle: bool) -> mi.Float:

@@ -9,6 +9,7 @@ from rimlight.edge_sampling.choice.silhouettes import Silhouettes
 from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_lines import TextureLines
+from rimlight.edge_sampling.parametrisation import Slides
 
 from .deep_shadows import DeepShadows
 from .face_planes import FacePlanes
@@ -23,7 +24,7 @@ from .shown_shadows import ShownShadows
 @dataclass(frozen=True)
 class Boundaries:
     """What samples the edges of a scene, for one answer to the question which meshes move, and whether the camera
-    does. Nothing where nothing moves. `limits` : what the derivative will lack. `glass` : see `Vicinity`. `mirrors` :
+    does. Nothing where nothing moves. `limits` : what the derivative will lack. `slides` : see `Vicinity`. `mirrors` :
     may the camera see edges in perfect mirrors, or through glass? `fine_mirrors` : those whose fringe is not looked
     at closely. `textures` : where those jump that the camera may see move, and mapped normals turn away. `shown` :
     shadows that mirrors or glass may show. `surfaces` : what chains meet, where there are mirrors or textures.
@@ -39,7 +40,7 @@ class Boundaries:
     camera_moves: bool = False
     lights_move: bool = False
     limits: tuple[str, ...] = ()
-    glass: bool = False
+    slides: Slides = Slides.NOTHING
     mirrors: bool = False
     fine_mirrors: FineMirrors | None = None
     textures: TextureLines | None = None

@@ -15,6 +15,9 @@ If g has different signs at the corners, c is the one that is alone with its sig
 If not, the curve may still enter and leave through one side: then c is the corner opposite, and s is between the two.
 
 As vertices, normals and viewer move, t follows by one step of Newton's method, whose derivative is exact.
+
+On the triangles that stand for the surface of a grid (`geometry/grids.py`), the same curve is about its outline. There,
+t is held: a point of a smooth surface that is on its outline moves over the film as the outline does.
 """
 
 from __future__ import annotations
@@ -26,7 +29,14 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.grids import is_grid
 from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
+
+#: How far before and behind a point near the outline of a grid its surface is met, in voxels.
+REACH = 12, 1.25
+
+#: And just beside its outline: how far before.
+BESIDE = 2.0
 
 #: Cosine to the viewer of a normal just beside the horizon.
 BESIDE_HORIZON = 1e-4
@@ -40,11 +50,13 @@ class Horizon:
     p : mi.Point3f, (N,), a point of the curve, or of an edge that such a curve may be close to, world space: what hides
         it is none of its sides.
     on_curve : mi.Bool, (N,), is it one of the curve? Then the normal *just* faces the viewer, or faces away.
+    reach : mi.Float, (N,), how far from p, across the surface, besides rounding, what it belongs to may be met.
     """
 
     side: mi.Float
     p: mi.Point3f
     on_curve: mi.Bool
+    reach: mi.Float
 
 
 @dataclass
@@ -54,12 +66,17 @@ class HorizonPoint:
     p : mi.Point3f, world space; attached to vertices, normals and viewer.
     tangent : mi.Vector3f, dp/ds. Detached.
     facing : mi.Vector3f, towards where normals face the viewer. Detached.
+    normal : mi.Vector3f, that is interpolated there. Detached.
+    forward : mi.Float; −1 where the curve runs back, as seen from the viewer, as seldom: there, the triangles of a grid
+        hide it, and the surface lies on the other side of it than elsewhere.
     valid : mi.Bool, is there one?
     """
 
     p: mi.Point3f
     tangent: mi.Vector3f
     facing: mi.Vector3f
+    normal: mi.Vector3f
+    forward: mi.Float
     valid: mi.Bool
 
 
@@ -72,11 +89,12 @@ class Horizons:
     moving : which of its meshes can move over the film.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("count", "_corners", "sign", "_number"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("count", "_corners", "sign", "_number", "_window", "any_grid"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, moving: np.ndarray):
         self.geometry = geometry
-        smooth = [bool(m) and is_smooth(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
+        has_curves = lambda mesh: is_grid(mesh) or is_smooth(mesh)
+        smooth = [bool(m) and has_curves(mesh) for mesh, m in zip(geometry.meshes, moving, strict=False)]
         #: (F, 3), their vertices.
         self.faces = faces = geometry.faces(tuple(smooth))
         self._corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(faces) else []
@@ -93,6 +111,14 @@ class Horizons:
         self._number = mi.UInt32(np.concatenate(numbers)) + dr.opaque(mi.UInt32, 0) if meshes else None
         #: Number of faces.
         self.count = len(faces)
+        #: Are there those of grids? Of each vertex, how far from the curve their outline may be, and the size of a
+        #: voxel; 0 of others.
+        self.any_grid = any(is_grid(m) for m in meshes)
+        sizes = [(m.window, m.voxel) if is_grid(m) else (0, 0) for m in geometry.meshes]
+        counts = [m.vertex_count() for m in geometry.meshes]
+        of_vertices = lambda k: [np.broadcast_to(s[k], n) for s, n in zip(sizes, counts, strict=True)]
+        number = lambda a: mi.Float(np.concatenate([*a, np.zeros(geometry.line_vertices)]).astype(np.float32))
+        self._window = [number(of_vertices(k)) * dr.opaque(mi.Float, 1) for k in (0, 1)] if self.any_grid else None
 
     def __len__(self) -> int:
         return self.count
@@ -136,6 +162,8 @@ class Horizons:
     ) -> HorizonPoint:
         """The point u in [0, 1) of the curve in a face. `positions`, `normals` and `eye` may be attached."""
         p, n = self._face(positions, normals, face)
+        with dr.suspend_grad():
+            front = dr.cross(p[1] - p[0], p[2] - p[0])
         p, n, start, end, valid = _arrange(p, n, dr.detach(eye), far)
         s = dr.lerp(start, end, u)
         D, N = dr.lerp(p[1] - p[0], p[2] - p[0], s), dr.lerp(n[1] - n[0], n[2] - n[0], s)
@@ -156,9 +184,43 @@ class Horizons:
             length2 = dr.squared_norm(tangent)
             valid &= (g_t != 0) & dr.isfinite(length2) & (length2 > 0)
             facing = mi.Vector3f(D) * dr.sign(g_t)
+            turns = [dr.dot(dr.cross(tangent, m), v) for m, v in ((normal, view), (front, facing))]
+            forward = dr.sign(turns[0]) * dr.sign(turns[1])
         now = _towards(p[0] + t * D, n[0] + t * N, eye, far)
         follows = t - dr.select(valid, (now - dr.detach(now)) / dr.select(valid, dr.detach(g_t), 1), 0)
-        return HorizonPoint(mi.Point3f(p[0] + follows * D), dr.detach(tangent), dr.detach(facing), valid)
+        if self.any_grid:
+            follows = dr.select(self.is_of_grid(face), t, follows)
+        detached = (dr.detach(v) for v in (tangent, facing, normal, forward))
+        return HorizonPoint(mi.Point3f(p[0] + follows * D), *detached, valid)
+
+    def is_of_grid(self, face: mi.UInt32) -> mi.Bool:
+        """Which faces stand for the surface of a grid?"""
+        return self.window(face)[1] > 0 if self.any_grid else mi.Bool(False)
+
+    def meets_grid(
+        self,
+        face: mi.UInt32,
+        p: mi.Point3f,
+        n: mi.Vector3f,
+        ray: mi.Ray3f,
+        si: mi.SurfaceInteraction3f,
+        before: float = REACH[0],
+    ) -> mi.Bool:
+        """Does a ray that passes a point p of the outline of a grid, with the normal n, meet the surface there, or
+        before it, at most so many voxels? What is farther behind p is hidden by what ends at the outline."""
+        window, voxel = self.window(face)
+        aside, behind = dr.abs_dot(dr.normalize(n), si.p - p), dr.dot(si.p - p, ray.d)
+        near = (behind >= -before * voxel) & (behind <= REACH[1] * voxel)
+        return si.is_valid() & near & (aside <= 2 * window + rounding(p, p))
+
+    def window(self, face: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+        """How far from the curves in faces of grids their outline may be, and the size of a voxel: scene units; 0 for
+        others."""
+        if not self.any_grid:
+            return mi.Float(0), mi.Float(0)
+        corners = [dr.gather(mi.UInt32, c, face) for c in self._corners]
+        largest = lambda of: dr.maximum(*(dr.gather(mi.Float, of, c) for c in corners[:2]))
+        return tuple(dr.maximum(largest(of), dr.gather(mi.Float, of, corners[2])) for of in self._window)
 
     def sees_dark_side(
         self, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active
@@ -228,7 +290,7 @@ def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -
     """
     to_viewer = -ray.d
     cos = dr.dot(si.sh_frame.n, to_viewer)
-    there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o)
+    there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o) + horizon.reach
     turn = there & si.is_valid() & (horizon.side != 0) & (horizon.on_curve | (horizon.side * cos <= 0))
     _turn(si, to_viewer, horizon.side, turn)
 

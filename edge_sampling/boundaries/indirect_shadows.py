@@ -175,7 +175,7 @@ class IndirectShadows(ShadowBoundary):
         met, jump, view.active = self._arriving(tracer, light, edge, shadow, view, ours)
         tangent, towards_light = (thrown(v, light, edge, shadow) for v in (edge.tangent, edge.lit))
         n_dl = dr.cross(shadow.facing, tangent) * (len(self) / edge.sample.density)
-        n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
+        n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light)) * edge.sign
         view.active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
         return view, met, jump, dr.select(view.active, n_dl, 0)
 

@@ -255,7 +255,7 @@ class ShadingBoundary:
             n_dl = dr.cross(ω, outline.tangent) / (distance * sample.density)
             f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ω), active)
             # Seen along its own face, an edge hides nothing, but rounding decides what a ray past it meets.
-            active = active & (sample.density > 0) & ~in_plane(si, p)
+            active = active & (sample.density > 0) & ~in_plane(si, p, outline.slack)
             active &= dr.any(f != 0) & dr.isfinite(dr.squared_norm(n_dl))
             across = dr.normalize(n_dl)
             outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
@@ -304,11 +304,11 @@ class ShadingBoundary:
             value = L * (edge - held * turning(n_dl, d, valid) - (1 - held) * turned)
             # From lamps, shadows are found as if directions did not turn, and none of the part of which they do.
             value += from_lamp * (dr.detach(division.turns(dr.squared_norm(d), ω)) * edge - (1 - held) * turned)
-            return faces * (edge - turned) - side * value
+            return dr.select(past, outline.sign, 1) * (faces * (edge - turned) - side * value)
 
     def _on_faces(self, sample: EdgeSample, outline, y, past, veiled) -> tuple[mi.Bool, Lune]:
         """Where normals that face away are turned; and from where the light comes that only planes of faces hide."""
-        soft = ~past & ~veiled & self.silhouettes.only_bends(sample) & spreads(y.bsdf()) & self.soft
+        soft = ~past & ~veiled & self.silhouettes.only_bends(sample, outline) & spreads(y.bsdf()) & self.soft
         return ~past | veiled, Lune.between(outline.tangent, outline.normals, soft)
 
     def _shown_by_faces(

@@ -138,7 +138,7 @@ class ShadowBoundary:
                 dr.detach(on_film(thrown(v, light, edge, shadow))) for v in (edge.tangent, edge.lit)
             )
             n_dl = mi.Vector2f(-tangent.y, tangent.x) / (edge.sample.density * light.density * (count / len(self)))
-            n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
+            n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light)) * edge.sign
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl = dr.select(active, n_dl, 0)
             view.active = active
@@ -252,7 +252,7 @@ class ShadowBoundary:
         lit = across * outline.outward(across, ω)
         emits = dr.select(light.on_surface, dr.dot(light.n, ω), 1) > 0
         active = (e.density > 0) & emits & dr.any(lit != 0)
-        return LitEdge(e, outline.p, outline.tangent, lit, d, ω, active, outline)
+        return LitEdge(e, outline.p, outline.tangent, lit, d, ω, active, outline, outline.slack, outline.sign)
 
     # ---------------------- What arrives where the shadow falls ----------------------
 
@@ -339,7 +339,7 @@ class LitEdge:
     """A point p of an edge as the light sees it, with the tangent there.
 
     lit : unit vector across edge and light, towards the lit side. d, ω : from the light to p, ω of unit length.
-    outline : all that is known of the point; None where it is on no edge.
+    outline : all that is known of the point; None where it is on no edge. slack, sign : see `OutlinePoint`.
     """
 
     sample: EdgeSample
@@ -350,6 +350,8 @@ class LitEdge:
     ω: mi.Vector3f
     active: mi.Bool
     outline: OutlinePoint | None = None
+    slack: mi.Float | float = 0.0
+    sign: mi.Float | float = 1.0
 
 
 @dataclass
@@ -390,7 +392,7 @@ class SeenShadow:
 
 def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
     p, ω, far = edge.p, edge.ω, light.far
-    aside = edge.lit * beside_edge(p, dr.select(far, p, light.y))
+    aside = edge.lit * (beside_edge(p, dr.select(far, p, light.y)) + edge.slack)
     ray = mi.Ray3f(p + aside, ω)
     ray.time = light.time
     fallen = scene.ray_intersect_preliminary(ray, active=edge.active)

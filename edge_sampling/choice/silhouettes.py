@@ -12,6 +12,7 @@ import numpy as np
 from rimlight.edge_sampling.geometry.curves import PIECES, Curves
 from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
+from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import Geometry
 
 from .edge_tree import EdgeTree
@@ -46,6 +47,8 @@ class OutlinePoint:
     tangent : mi.Vector3f, dp/dt, where t is the parameter that was sampled. Detached.
     inwards : two vectors from p towards the faces on the two sides of an edge. Detached.
     is_line : is it on a line in which shapes cut through each other? Then both faces go on beyond it.
+    slack : how far from p what is rendered may lie, scene units: 0 but for grids. concave : is it on an edge of a grid
+        that is bent inwards?
     slides : is it on a contour, which slides over its surface?
     """
 
@@ -54,6 +57,8 @@ class OutlinePoint:
     inwards: tuple[mi.Vector3f, mi.Vector3f]
     is_line: mi.Bool
     slides: mi.Bool
+    slack: mi.Float
+    concave: mi.Bool
 
     @property
     def normals(self) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -71,7 +76,15 @@ class OutlinePoint:
         faces = [-dr.dot(n, d) > least * dr.norm(n) for n in self.normals]
         inwards = [dr.dot(v, across) for v in self.inwards]
         inwards = dr.select(dr.abs(inwards[0]) > dr.abs(inwards[1]), inwards[0], inwards[1])
-        return dr.select(faces[0] != faces[1], -dr.sign(inwards), 0)
+        outward = dr.select(faces[0] != faces[1], -dr.sign(inwards), 0)
+        # What is bent inwards is seen from the side of its faces.
+        return dr.select(self.concave, -outward, outward)
+
+    @property
+    def sign(self) -> mi.Float:
+        """With which sign a silhouette counts: −1 where triangles of a grid are bent inwards. There, the line of all
+        silhouettes runs back, so that with this sign it is as long as that of the surface."""
+        return dr.select(self.concave, mi.Float(-1), 1)
 
     def is_behind(self, n: mi.Vector3f, ω: mi.Vector3f) -> mi.Bool:
         """Do its faces lie behind a surface in which the point is? Then that hides the edge. Where shapes cut through
@@ -97,7 +110,7 @@ class Silhouettes:
     """
 
     _NUMBERS = ("count", "groups", "centre", "_first_line", "_still")
-    DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", *_NUMBERS))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", "grids", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(
         self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None, lamps: Sequence[mi.Shape] = ()
@@ -105,6 +118,8 @@ class Silhouettes:
         self.geometry = geometry
         #: In which shapes cut through each other; they are the last edges.
         self.lines = geometry.lines
+        #: What stands for their surfaces is among the edges.
+        self.grids = grids_of(geometry)
         self.count = len(edges)
         self._first_line = dr.opaque(mi.UInt32, self.count - int(edges.is_line.sum()))
         moves = np.ones(len(edges), bool)
@@ -218,11 +233,12 @@ class Silhouettes:
         still = (sample.edge < self.count) & dr.gather(mi.Bool, self._still, dr.minimum(sample.edge, self.count - 1))
         return dr.select(still, use[1], use[0])
 
-    def only_bends(self, sample: EdgeSample) -> mi.Bool:
+    def only_bends(self, sample: EdgeSample, outline: OutlinePoint) -> mi.Bool:
         """Is it on an edge across which nothing differs but the planes of two smooth-shaded faces?"""
         if self.tree is None:
             return mi.Bool(False)
-        return (sample.edge < self.count) & self.tree.device_edges.is_smooth(dr.minimum(sample.edge, self.count - 1))
+        of_mesh = (sample.edge < self.count) & (outline.slack == 0)
+        return of_mesh & self.tree.device_edges.is_smooth(dr.minimum(sample.edge, self.count - 1))
 
     def beside(
         self, scene: mi.Scene, placement: Placement, sample: EdgeSample, p: mi.Point3f, x: mi.Point3f
@@ -249,7 +265,8 @@ class Silhouettes:
             with dr.suspend_grad():
                 inwards = tuple(dr.detach(o - p) for o in edges.opposite(placement.positions, index))
                 is_line = index >= self._first_line if self.lines else mi.Bool(False)
-                point = OutlinePoint(p, dr.detach(b - a), inwards, is_line, mi.Bool(False))
+                of_grid = edges.slack(index), edges.is_concave(placement.positions, index)
+                point = OutlinePoint(p, dr.detach(b - a), inwards, is_line, mi.Bool(False), *of_grid)
             if edges.curves is not None:
                 curved, on_curve, tangent = edges.on_curve(placement.positions, index, sample.t)
                 point.p = dr.select(curved, on_curve, point.p)
@@ -262,13 +279,14 @@ class Silhouettes:
         c = self.curves.point(placement.frames, piece, sample.t, eye, far)
         # Where there is none, both sides seem to have a face.
         inwards = (c.inwards, dr.select(c.valid, c.other, -c.inwards))
-        on_curve = OutlinePoint(c.p, c.tangent, inwards, mi.Bool(False), c.slides)
+        on_curve = OutlinePoint(c.p, c.tangent, inwards, mi.Bool(False), c.slides, mi.Float(0), mi.Bool(False))
         if self.tree is None:
             return on_curve
         choose = lambda x, y: dr.select(on_edge, x, y)
         inwards = tuple(choose(x, y) for x, y in zip(point.inwards, on_curve.inwards, strict=True))
         p, tangent = choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent)
-        return OutlinePoint(p, tangent, inwards, point.is_line & on_edge, c.slides & ~on_edge)
+        slack, concave = dr.select(on_edge, point.slack, 0), point.concave & on_edge
+        return OutlinePoint(p, tangent, inwards, point.is_line & on_edge, c.slides & ~on_edge, slack, concave)
 
 
 def _borders(geometry: Geometry, edges: Edges, lamps: Sequence[mi.Shape]) -> np.ndarray | None:

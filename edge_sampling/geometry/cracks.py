@@ -8,6 +8,7 @@ is no hole. End points that are a little apart count as one: cracks that are nar
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -27,6 +28,9 @@ ON_EDGE = 1e-5
 
 #: Edges are parallel within this sine.
 PARALLEL = 1e-4
+
+#: Height of a triangle, relative to its longest side, up to which it has no area.
+SLIVER = 1e-6
 
 #: At most so many pairs of an edge and an end point near it are looked at: a soup of long triangles has too many.
 PAIRS = 10**7
@@ -227,3 +231,18 @@ def _is_even(mesh: object) -> bool:
     """Is the plane of its faces all that differs between the faces of a mesh?"""
     varies = meshes.has_interpolated_normals(mesh) or meshes.jumps_at_every_edge(mesh)
     return not varies and meshes.vertex_values(mesh).shape[1] == 0
+
+
+def has_open_sliver(mesh: Any) -> bool:
+    """Does a face that has no area, but different corners, lie along the open border of a mesh?"""
+    p, corners = meshes.vertices(mesh).astype(np.float64), meshes.faces(mesh)
+    sides = p[np.roll(corners, -1, 1)] - p[corners]
+    squared = np.square(sides).sum(2)
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    thin = (area <= SLIVER * squared.max(1)) & (squared.min(1) > 0)
+    if not thin.any():
+        return False
+    place = np.unique(p, axis=0, return_inverse=True)[1].ravel()
+    ends = np.sort(place[np.stack([corners, np.roll(corners, -1, 1)], 2)], 2).reshape(-1, 2)
+    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    return bool((count[edge.ravel()].reshape(-1, 3)[thin] == 1).any())

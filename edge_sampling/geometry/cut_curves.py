@@ -26,6 +26,7 @@ import numpy as np
 
 from .cut_surfaces import BEYOND, KINDS, STEEP, TURN, WITHIN, Kind, Surface, across, nearest, triangles, trim
 from .edges import Edges
+from .grids import is_grid
 from .intersections import IN_ONE_PLANE, LEAST_SPACE, VERTICES, line_edges, stay_on
 from .meshes import Geometry, faces, positions_of
 
@@ -374,6 +375,7 @@ def _overlapping(geometry: Geometry) -> list[tuple[int, int]]:
     meshes, analytic = geometry.meshes, geometry.analytic
     boxes = np.array([(*b.min, *b.max) for b in (s.bbox() for s in (*meshes, *analytic))], np.float64)
     size = np.linalg.norm(boxes[:, 3:] - boxes[:, :3], axis=1)
+    boxes[[*(is_grid(m) for m in meshes), *(False for _ in analytic)]] = np.nan  # which overlap nothing
     found = []
     for k, shape in enumerate(analytic):
         i = len(meshes) + k

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from rimlight.edge_sampling.refusals import InputError
 
 from . import meshes
+from .grids import is_grid
 from .meshes import Geometry
 
 
@@ -159,13 +160,14 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     mesh0, mesh1 = mesh_of_face[face0], mesh_of_face[face1]
 
     interpolated = np.array([meshes.has_interpolated_normals(m) for m in geometry.meshes])
-    everywhere = np.array([meshes.jumps_at_every_edge(m) for m in geometry.meshes])
+    everywhere = np.array([not is_grid(m) and meshes.jumps_at_every_edge(m) for m in geometry.meshes])
     split = (i0 != i1) | (j0 != j1)
     seam = split & ((value[i0] != value[i1]).any(1) | (value[j0] != value[j1]).any(1))
 
     kind = np.full(len(face0), EdgeKind.SMOOTH, np.uint8)
     kind[split] = EdgeKind.SPLIT
     kind[~interpolated[mesh0]] = EdgeKind.FLAT
+    kind[_inside_of_voxels(geometry, np.stack([i0, j0], 1), mesh0)] = EdgeKind.SMOOTH
     kind[(count != 2) | opposed | (mesh0 != mesh1) | seam | everywhere[mesh0]] = EdgeKind.JUMP
     edges = Edges(
         vertices=np.stack([np.stack([i0, j0], 1), np.stack([i1, j1], 1)], 1).astype(np.uint32),
@@ -178,6 +180,16 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
         joined=np.zeros(len(face0), bool),
     )
     return edges, Weld(weld, tolerance)
+
+
+def _inside_of_voxels(geometry: Geometry, ends: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """Which edges are inside of the voxels of a grid, where its surface is smooth: (E,), bool."""
+    inside, offset = np.zeros(len(ends), bool), 0
+    for i, m in enumerate(geometry.meshes):
+        if is_grid(m):
+            inside |= (mesh == i) & (ends >= offset + m.on_faces).any(1)
+        offset += m.vertex_count()
+    return inside
 
 
 def _no_edges() -> Edges:

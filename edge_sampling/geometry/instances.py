@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .grids import has_changing_values, slide_on_grid
 from .meshes import (
     Geometry,
     attribute_of,
@@ -182,10 +183,13 @@ def surface_met(
     """What a ray meets, attached to the motion of instances, too.
 
     Mitsuba 3.9 knows how the points of an instance move, but not how its normals and texture coordinates change. And of
-    an instance that moves, it does not know either what the motion of the ray does to them.
+    an instance that moves, it does not know either what the motion of the ray does to them. For grids whose values
+    change, see `slide_on_grid`.
     """
     si = pi.compute_surface_interaction(ray, flags, active)
     for shape in scene.shapes():
+        if shape.class_name() == "SDFGrid" and not flags & mi.RayFlags.FollowShape and has_changing_values(shape):
+            slide_on_grid(si, ray, pi, flags, active & si.is_valid() & (pi.shape == mi.ShapePtr(shape)))
         if shape.class_name() == "Instance" and _moves(shape) and dr.grad_enabled(matrix_of(shape), ray.o, ray.d):
             on_shape = active & si.is_valid() & (pi.instance == mi.ShapePtr(shape))
             _attach(si, mi.AffineTransform4f(matrix_of(shape, on_shape)), ray, pi, flags, on_shape)

@@ -22,6 +22,7 @@ import numpy as np
 
 from .device_edges import rounding
 from .edges import WHOLE, EdgeKind, Edges, Weld
+from .grids import is_grid
 from .meshes import Geometry, number_of, positions_of, tells_shapes_in_groups
 from .rigid_motion import Shapes
 
@@ -113,7 +114,8 @@ class Intersections:
         before = self.shapes, self.capacity
         boxes = _overlapping(geometry)
         with dr.suspend_grad():
-            alone = self._forms.changed(arrays) | self._by_themselves
+            grids = {i for i, m in enumerate(geometry.meshes) if is_grid(m)}
+            alone = (self._forms.changed(arrays) | self._by_themselves) - grids
             everywhere = {i: np.array([[-np.inf] * 3, [np.inf] * 3]) for i in alone}
             self._search(scene, dr.detach(replace(geometry, lines=()).positions()), boxes | everywhere)
         self.shapes = tuple(sorted(boxes.keys() | self._by_themselves))
@@ -380,7 +382,8 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
     with others, (2, 3)."""
     if len(geometry.meshes) < 2:
         return {}
-    boxes = np.array([(*b.min, *b.max) for b in (m.bbox() for m in geometry.meshes)])
+    boxes = np.array([(*b.min, *b.max) for b in (m.bbox() for m in geometry.meshes)], float)
+    boxes[[is_grid(m) for m in geometry.meshes]] = np.nan  # which overlap nothing
     lower, upper = boxes[:, :3], boxes[:, 3:]
     overlap = (lower[:, None] <= upper).all(2)
     overlap &= overlap.T
@@ -393,9 +396,10 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
 
 def _first_meshes(geometry: Geometry) -> mi.UInt32:
     """By the number that Dr.Jit gives to a shape: that of its mesh, or of an instance's first one, plus 1. Else 0."""
-    numbers = [number_of(getattr(m, "instance", m)) for m in geometry.meshes]
+    numbers = [0 if is_grid(m) else number_of(getattr(m, "instance", m)) for m in geometry.meshes]
     table = np.zeros(max(numbers, default=0) + 1, np.uint32)
     table[numbers[::-1]] = np.arange(len(numbers), 0, -1)
+    table[0] = 0
     return mi.UInt32(table)
 
 

@@ -31,9 +31,10 @@ OLD = "vertex_positions_buffer"
 class Geometry:
     """The shapes of a scene, sorted by what can be done with them.
 
-    meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known.
+    meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known; and what stands for
+        such: see `Instances` and `Grids`.
     analytic : spheres, disks, cylinders, whose outlines are known curves.
-    others : all else (hair, ...; instances, until `Instances` finds their meshes). They occlude and receive light, but
+    others : all else (hair, ...; instances and grids, until theirs are found). They occlude and receive light, but
         must not move.
     lines : in which shapes cut through each other (`CutCurves`, `Intersections`), whose vertices then come after those
         of the meshes.
@@ -370,7 +371,8 @@ def _concat(buffers: list[mi.Float]) -> mi.Float:
 
 
 def inner(shape: Any) -> Any:
-    """A shape itself; of a mesh as an instance shows it (`MeshOfInstance`), the mesh in the shape group."""
+    """A shape itself; of a mesh as an instance shows it (`MeshOfInstance`), the mesh in the shape group; of
+    `SurfaceOfGrid`, the grid."""
     return getattr(shape, "inner", shape)
 
 
@@ -380,8 +382,8 @@ def number_of(shape: Any) -> int:
 
 
 def pointer(shape: Any) -> mi.ShapePtr:
-    """To a shape; to the instance that shows a mesh (`MeshOfInstance`)."""
-    return mi.ShapePtr(getattr(shape, "instance", shape))
+    """To a shape; to the instance that shows a mesh (`MeshOfInstance`), or the grid of a `SurfaceOfGrid`."""
+    return mi.ShapePtr(getattr(shape, "instance", inner(shape)))
 
 
 def is_met(met: mi.PreliminaryIntersection3f | mi.SurfaceInteraction3f, pointer: mi.ShapePtr) -> mi.Bool:

@@ -1,4 +1,5 @@
-"""Spheres, disks and cylinders that cut through hair and implicit surfaces: in curves, whose jumps are not sampled."""
+"""Spheres, disks and cylinders that cut through hair, and grids that cut through anything: in curves, whose jumps are
+not sampled."""
 
 from __future__ import annotations
 
@@ -6,13 +7,53 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .meshes import Geometry, is_met
+from .device_edges import rounding
+from .grids import grids_of
+from .meshes import Geometry, faces, is_met, number_of, vertices
 
 #: Lines over a shape, in each of two directions, along which others are sought.
 LINES = 24
 
 #: How far inside of the shape these are, relative to it, so that what only touches it does not count.
 INSIDE = 1e-3
+
+#: How often a line over the surface of a grid may meet that itself, before it meets another one.
+OFTEN = 8
+
+
+def cuts_of_grids(scene: mi.Scene, geometry: Geometry) -> list[tuple[mi.Shape, mi.Shape]]:
+    """Grids, each with another shape that cuts through its surface. On the host."""
+    found = []
+    with dr.suspend_grad():
+        for grid in grids_of(geometry):
+            sides = faces(grid)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+            p = vertices(grid)[np.unique(np.sort(sides, axis=1), axis=0)]
+            numbers = set(_first_met(scene, grid.inner, p[:, 0], p[:, 1]).tolist())
+            found += [(grid.inner, s) for s in scene.shapes() if number_of(s) in numbers]
+    return found
+
+
+def _first_met(scene: mi.Scene, shape: mi.Shape, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Numbers of the first shapes, or instances, that lines from a to b meet besides one shape; 0: none."""
+    point = lambda v: mi.Point3f(*(mi.Float(np.ascontiguousarray(x, np.float32)) for x in v.T))
+    a, b = point(a), point(b)
+    length, own = dr.norm(b - a), mi.ShapePtr(shape)
+    d, step = (b - a) / length, rounding(a, b)
+
+    def onwards(t, met, k, active):
+        ray = mi.Ray3f(mi.Point3f(a + t * d), d)
+        ray.maxt = length - t
+        pi = scene.ray_intersect_preliminary(ray, active=active)
+        active &= pi.is_valid()
+        which = dr.select(pi.instance != None, pi.instance, pi.shape)  # noqa: E711
+        other = active & (which != own)
+        met = dr.select(other, dr.reinterpret_array(mi.UInt32, which), met)
+        t += pi.t + step
+        return t, met, k + 1, active & ~other & (t < length) & (k < OFTEN)
+
+    zero = dr.zeros(mi.UInt32, dr.width(length))
+    state = (dr.zeros(mi.Float, dr.width(length)), zero, mi.UInt32(zero), length > step)
+    return dr.while_loop(state, lambda *s: s[-1], onwards, label="lines over a grid")[1].numpy()
 
 
 def cuts_of_others(scene: mi.Scene, geometry: Geometry) -> list[tuple[mi.Shape, mi.Shape]]:

@@ -20,8 +20,10 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
-from rimlight.edge_sampling.geometry.meshes import faces, has_normal_map, lets_rays_through, surfaces, vertices
-from rimlight.edge_sampling.geometry.other_cuts import cuts_of_others
+from rimlight.edge_sampling.geometry.cracks import has_open_sliver
+from rimlight.edge_sampling.geometry.grids import grids_of
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
+from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
@@ -253,11 +255,18 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
 def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving) -> list[str]:
     """What lacks at the outlines of shapes."""
     limits = []
-    grids = names(s for s in scene.shapes() if s.class_name() == "SDFGrid")
+    grids = names(s for s in geometry.others if s.class_name() == "SDFGrid")
     if grids:
         limits.append(
-            f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid). Replace "
-            "them by meshes."
+            f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid), which are not "
+            "known: give the grid as many values along each axis as along the others."
+        )
+    hard = any(e.flags() & mi.EmitterFlags.Delta or hasattr(e, "light_count") for e in scene.emitters())
+    shaded = names(g.inner for g in grids_of(geometry) if moving.anything and (hard or not g.has_vertex_normals()))
+    if shaded:
+        limits.append(
+            f"the derivative is off by up to a tenth in parts of the shading of {', '.join(shaded)} (sdfgrid): with "
+            "analytic normals; and in lights without a size, at the shadow that it throws on itself."
         )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:
@@ -279,6 +288,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"the derivative may count part of the open borders of {', '.join(doubled)} twice, where faces without "
             "area lie along them. Remove these faces."
         )
+    pairs = [f'"{a.id()}" and "{b.id()}"' for a, b in cuts_of_grids(scene, geometry)]
+    if pairs:
+        limits.append(
+            f"the derivative lacks the curves in which grids of signed distances cut through other shapes: "
+            f"{', '.join(pairs)}. Replace the grids by meshes, or move them apart."
+        )
     closed = {
         tuple(geometry.meshes[i].id() for i in pair): width
         for pair, width in cracks.widest().items()
@@ -291,25 +306,6 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"units wide: {pairs}. Join the vertices there, or move them farther apart."
         )
     return limits
-
-
-def has_open_sliver(mesh: mi.Mesh) -> bool:
-    """Does a face that has no area, but different corners, lie along the open border of a mesh?"""
-    p, corners = vertices(mesh).astype(np.float64), faces(mesh)
-    sides = p[np.roll(corners, -1, 1)] - p[corners]
-    squared = np.square(sides).sum(2)
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    thin = (area <= SLIVER * squared.max(1)) & (squared.min(1) > 0)
-    if not thin.any():
-        return False
-    place = np.unique(p, axis=0, return_inverse=True)[1].ravel()
-    ends = np.sort(place[np.stack([corners, np.roll(corners, -1, 1)], 2)], 2).reshape(-1, 2)
-    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    return bool((count[edge.ravel()].reshape(-1, 3)[thin] == 1).any())
-
-
-#: Height of a triangle, relative to its longest side, up to which it has no area.
-SLIVER = 1e-6
 
 
 def has_its_inverse(shape: Any) -> bool:

@@ -38,13 +38,14 @@ from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
+from rimlight.edge_sampling.geometry.grids import Grids
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.interpolated import normals_turn, texture_slides
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
 from rimlight.edge_sampling.geometry.meshes import inner, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
-from rimlight.edge_sampling.parametrisation import slides_behind_glass
+from rimlight.edge_sampling.parametrisation import Slides, slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
@@ -77,7 +78,7 @@ class BoundarySearch:
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
         self._cracks = Cracks.none()
-        self._instances = Instances()
+        self._instances, self._grids = Instances(), Grids()
         self._curves: CutCurves | None = None
         self._rims: Rims | None = None
         self._lines: Intersections | None = None
@@ -102,7 +103,7 @@ class BoundarySearch:
 
         sppi : samples per pixel of the boundaries at shading points.
         """
-        geometry, found = self._instances.geometry(scene), parameters(scene)
+        geometry, found = self._grids.geometry(self._instances.geometry(scene)), parameters(scene)
         self._renew(scene, found, geometry)
         with dr.resume_grad():
             self._media.refuse_gradients(self.who)
@@ -124,6 +125,10 @@ class BoundarySearch:
         boundaries = self._boundaries[key]
         if boundaries.shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
             boundaries.shading.boxes.find_shapes()
+        if self.depths.scatters(2) and any(
+            p.node.class_name() == "SDFGrid" and p.name.endswith("grid") for p in changing
+        ):
+            boundaries = replace(boundaries, slides=Slides.EVERYTHING)
         limits += (*boundaries.limits, *self._limits_of_sensor(sensor, moving))
         return replace(boundaries, limits=limits) if limits != boundaries.limits else boundaries
 
@@ -206,13 +211,13 @@ class BoundarySearch:
     def _refuse_instances(self, moving: Moving) -> None:
         """Refuse instances that move, and are perfect mirrors or glass: how what they show slides is not known; and
         those that are flat, on which Mitsuba does not know what a ray meets."""
-        mirrors = names(s for s in moving.shapes if inner(s) is not s and is_mirror(s))
+        mirrors = names(s for s in moving.shapes if hasattr(s, "instance") and is_mirror(s))
         if mirrors:
             raise Refusal(
                 f"{self.who}: instances {', '.join(mirrors)} move, and are mirrors or glass: where the jumps in what "
                 "they show go is not known. Replace them by meshes."
             )
-        flat = names(s for s in moving.shapes if inner(s) is not s and is_flat(s.instance))
+        flat = names(s for s in moving.shapes if hasattr(s, "instance") and is_flat(s.instance))
         if flat:
             raise Refusal(
                 f'{self.who}: instances {", ".join(flat)} move, and are flat: their "to_world" has no inverse. Give '
@@ -240,10 +245,11 @@ class BoundarySearch:
         limits = lasting_limits(scene, self.geometry, self._cracks, self.depths, moving, sppi, **abilities)
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
+        slides = Slides.BEHIND_GLASS if glass else Slides.NOTHING
         what = moving.flags, moving.camera, moving.lights
         chains = self._chains(scene, moving, sppi)
         lights = LightChoice.of(scene)
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, glass, *chains, lights, deep, lamps)
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, lights, deep, lamps)
 
     def _chains(
         self, scene: mi.Scene, moving: Moving, sppi: int

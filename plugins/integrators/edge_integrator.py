@@ -266,7 +266,7 @@ class EdgeIntegrator(ADIntegrator):
         boundaries = self._boundaries(scene, sensor, counts.shading)
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
         tracer = self.TRACER(scene, self)
-        tracer.glass, tracer.lights, tracer.lamps = boundaries.glass, boundaries.lights, boundaries.lamps
+        tracer.slides, tracer.lights, tracer.lamps = boundaries.slides, boundaries.lights, boundaries.lamps
         tracer.fine_mirrors = boundaries.fine_mirrors
         return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.TERMS, self.shares)
 

@@ -225,7 +225,7 @@ class BidirectionalTracer(PathTracer):
         camera, light = Part(found.camera, lane, way.scatters), Part(found.light, subpath, number)
         end = dr.select(way.connected, start, way.end)
         L = found.from_camera.standing_for_all
-        held = self.glass, self.lamps
+        held = self.slides, self.lamps
         return WholePaths(self.scene, camera, light, end, L, ray, found.pi, way.sampled, *held, self.around)
 
     def light_paths_seen(self, found: FoundPaths, ray: mi.RayDifferential3f) -> WholePaths:
@@ -238,5 +238,5 @@ class BidirectionalTracer(PathTracer):
         no = mi.Bool(False)
         nothing = Part(found.camera, mi.UInt32(0), dr.zeros(mi.UInt32, dr.width(lane)))
         light = Part(found.light, lane, seen.number)
-        held = self.glass, self.lamps
+        held = self.slides, self.lamps
         return WholePaths(self.scene, nothing, light, found.ends, L, ray, pi, no, *held, self.around)

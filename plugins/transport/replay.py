@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight, axis_of
-from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
+from rimlight.edge_sampling.parametrisation import Slides, Vicinity, look_from, seen_by_camera, sliding_point
 from rimlight.edge_sampling.refusals import Refusal
 
 from .log import Log
@@ -374,7 +374,7 @@ class ChosenVertex(MovingVertex):
     """One vertex of each path, chosen in proportion to its throughput, as it moves.
 
     sampler : of the paths.
-    glass : see `Vicinity`. lamps : see `Chain`.
+    slides : see `Vicinity`. lamps : see `Chain`.
     """
 
     def __init__(
@@ -385,10 +385,10 @@ class ChosenVertex(MovingVertex):
         first: Vertex,
         depths: Depths,
         mode: dr.ADMode,
-        glass: bool,
+        slides: Slides,
         lamps: DividedLight | None = None,
     ):
-        vicinity = Vicinity.of(first.pi, glass)
+        vicinity = Vicinity.of(first.pi, slides)
         chain = Chain(scene, vicinity)
 
         def follow(log):

@@ -13,7 +13,7 @@ from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, tur
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
-from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera
+from rimlight.edge_sampling.parametrisation import Slides, Vicinity, seen_by_camera
 from rimlight.edge_sampling.rays import spawn_ray
 
 from .paths import Depths, Vertex, scattered_light
@@ -43,7 +43,7 @@ class PathTracer:
     """
 
     #: See `Vicinity`.
-    glass = False
+    slides = Slides.NOTHING
 
     #: See `Scattering`.
     lights: LightChoice | None = None
@@ -107,7 +107,7 @@ class PathTracer:
 
         # ---------------------- Light that it scatters ----------------------
 
-        vicinity = Vicinity.of(pi, self.glass) if attached and self.scatters(2) else None
+        vicinity = Vicinity.of(pi, self.slides) if attached and self.scatters(2) else None
         direct, onwards = scattering.scatter(
             si, bsdf, scattering.draw(sampler, active), active, vicinity, directions=directions
         )
@@ -185,7 +185,7 @@ class PathTracer:
                     turning = self.lamps.turning(si, si.bsdf(), pi.is_valid())
             return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0), turning), None
         depths = replace(self.depths, max_depth=self.depths.max_depth - beyond)
-        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.glass, self.lamps)
+        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.slides, self.lamps)
         moves = c.since < c.depth, c.vicinity
         return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, *moves, c.density, c.turning), c
 

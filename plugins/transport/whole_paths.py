@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.divided_light import DividedLight
-from rimlight.edge_sampling.parametrisation import Vicinity, seen_by_camera, shown_by_mirror
+from rimlight.edge_sampling.parametrisation import Slides, Vicinity, seen_by_camera, shown_by_mirror
 from rimlight.edge_sampling.rays import lift, spawn_ray
 
 from .emission import Around
@@ -54,7 +54,7 @@ class WholePaths:
     ray : camera ray, attached to the camera.
     seen : what the ray meets: the first vertex; or the light, if nothing scatters on the way.
     joined : mi.Bool, is the last vertex joined with a point that was sampled on a light?
-    glass : see `Vicinity`. lamps : see `Scattering`. around : the scene.
+    slides : see `Vicinity`. lamps : see `Scattering`. around : the scene.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class WholePaths:
         ray: mi.RayDifferential3f,
         seen: mi.PreliminaryIntersection3f,
         joined: mi.Bool,
-        glass: bool,
+        slides: Slides,
         lamps: DividedLight | None,
         around: Around,
     ):
@@ -77,7 +77,7 @@ class WholePaths:
         self.n = camera.count + light.count
         self.radius = around.radius
         self.seen = mi.PreliminaryIntersection3f(seen)
-        self.chain = Chain(scene, Vicinity.of(seen, glass), lamps=lamps)
+        self.chain = Chain(scene, Vicinity.of(seen, slides), lamps=lamps)
         self.scattering = self.chain.scattering
         self.lamps = lamps
         self.delta = mi.has_flag(end.emitter.flags(), mi.EmitterFlags.Delta)

@@ -141,9 +141,8 @@ def test_bitmaps_of_any_size_and_format_are_interpolated_without_steps(filter_ty
 
 
 @pytest.mark.parametrize("options", [{}, {"sppi": 0}], ids=str)
-def test_silhouettes_of_sdfgrid_are_warned_about(options):
-    x = np.linspace(-1, 1, 8)
-    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+def test_silhouettes_of_grids_that_are_no_cubes_are_warned_about(options):
+    z, y, x = np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 6), np.linspace(-1, 1, 8), indexing="ij")
     grid = mi.TensorXf((np.sqrt(x * x + y * y + z * z) - 0.8)[..., None].astype(np.float32))
     scene = cases.cube(grid=lambda: {"type": "sdfgrid", "grid": grid})()
     assert sum('silhouettes of "grid" (sdfgrid)' in m for m in said(scene, "cube.vertex_positions", **options)) == 1

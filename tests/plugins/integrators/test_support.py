@@ -166,13 +166,6 @@ def curve(kind: str, folder: Path, place) -> dict:
     return {"type": kind, "filename": str(file)}
 
 
-def signed_distances() -> dict:
-    x = np.linspace(-1, 1, 12)
-    z, y, x = np.meshgrid(x, x, x, indexing="ij")
-    d = np.sqrt(x * x + y * y + z * z) - 0.8
-    return {"type": "sdfgrid", "normals": "smooth", "grid": mi.TensorXf(d[..., None].astype(np.float32))}
-
-
 def volume(filter_type: str, voxels: np.ndarray | None = None) -> dict:
     """Colours in space. voxels : (Z, Y, X, 3); None: random ones."""
     voxels = np.random.default_rng(0).uniform(0.1, 0.9, (4, 4, 4, 3)) if voxels is None else voxels
@@ -189,11 +182,6 @@ def at(place, size: float = 0.35):
 def analytic(kind: str) -> Callable[..., dict]:
     bsdf = cases.diffuse(0.5, two_sided=True)
     return lambda name, place, folder: {"type": kind, "to_world": at(place), "bsdf": bsdf}
-
-
-def grid_shape(name, place, folder) -> dict:
-    box = at(place, 0.7) @ mi.ScalarTransform4f().translate([-0.5, -0.5, -0.5])
-    return {**signed_distances(), "to_world": box}
 
 
 def mask() -> dict:
@@ -272,7 +260,6 @@ CELLS = {
     "`cylinder`": Cell(analytic("cylinder"), shape=True),
     "`bsplinecurve`": Cell(lambda name, place, folder: curve("bsplinecurve", folder, place), shape=True),
     "`linearcurve`": Cell(lambda name, place, folder: curve("linearcurve", folder, place), shape=True),
-    "`sdfgrid`": Cell(grid_shape, shape=True),
 }
 ANALYTIC = ("`sphere`", "`disk`", "`cylinder`")
 PIXELS = 8
@@ -803,8 +790,6 @@ MESSAGES = {
             lambda folder: {"thing": curve("linearcurve", folder, np.zeros(3))}, SILHOUETTES, "thing.control_points"
         ),
     ],
-    "`sdfgrid`": [still(signed_distances, "thing.grid")],
-    ("`sdfgrid`", "passed"): [still(signed_distances, "", 'at the silhouettes of "thing"')],
     "`ellipsoids`, `ellipsoidsmesh`": [
         still(lambda: ellipsoids("ellipsoids"), "thing.data"),
         still(lambda: ellipsoids("ellipsoidsmesh"), "thing.data"),
@@ -838,6 +823,7 @@ ELSEWHERE = {
     "`ply`, `obj`, `serialized`": [test_files_equal_meshes_in_memory],
     "`rectangle`": ["room_floor_turns", "room_cube"],
     "`cube`": ["cube_depth"],
+    "`sdfgrid`": ["grid_slides", "grid_slides_gaussian", "grid_grows", "grid_lamp", "grid_along_axis"],
     "`merge`": [test_merged_shapes_equal_their_parts],
     "`instance` of meshes": ["chair_slides", "chair_turns", "stretched_ball", test_something_passes_an_instance],
     "`instance` of other shapes; what is in a `shapegroup`": [test_something_passes_an_instance],
