@@ -13,6 +13,9 @@ from rimlight._collection import no_collection
 from rimlight.edge_sampling.geometry.meshes import is_positions_key, present_key
 from rimlight.edge_sampling.refusals import InputError
 
+#: Of longer lists, a motion's text shows so many entries only: a grid of 64³ values would make it 3 MB.
+SHOWN = 32
+
 
 class Motion:
     """Moves one parameter of a scene along a line, or turns it about an axis: p(θ), where p(0) is its present value.
@@ -94,11 +97,11 @@ class Motion:
         return "scene unit" if self.is_positions or self.is_transform else "unit"
 
     def __str__(self) -> str:
-        numbers = lambda a: "(" + ", ".join(f"{x:g}" for x in a) + ")"
+        numbers = lambda a: "(" + _shown([f"{x:g}" for x in a]) + ")"
         how = f"along {numbers(self.direction)}" if self.rotate is None else f"about {numbers(self.rotate)}"
         if self.moves is None or self.moves.all():
             return f"{self.key} {how}"
-        return f"{self.key} {how}, vertices {', '.join(map(str, np.flatnonzero(self.moves)))}"
+        return f"{self.key} {how}, vertices {_shown([str(i) for i in np.flatnonzero(self.moves)])}"
 
     def apply(self, theta: mi.Float | float) -> None:
         """Set the parameter to p(θ) and update the scene; attached if `theta` is."""
@@ -150,6 +153,13 @@ def derivative_image(
     finally:
         motion.apply(0.0)
     return image
+
+
+def _shown(values: Sequence[str]) -> str:
+    """The entries of a list; of a long one, the first and how many there are."""
+    if len(values) <= SHOWN:
+        return ", ".join(values)
+    return ", ".join([*values[:SHOWN], f"... of {len(values)}"])
 
 
 def _vector(a: np.ndarray) -> mi.Vector3f:

@@ -79,3 +79,11 @@ def test_a_direction_has_a_number_for_each_element_of_an_array():
     motion = Motion(it, "card.vertex_texcoords", direction=range(6))
     motion.apply(2.0)
     assert np.allclose(np.array(motion.params["card.vertex_texcoords"]), np.ravel(coordinates) + 2 * np.arange(6))
+
+
+def test_the_text_of_a_motion_stays_short():
+    corners = np.random.default_rng(0).normal(size=(999, 3))
+    it = mi.load_dict({"type": "scene", "soup": mesh("soup", corners, np.arange(999).reshape(-1, 3))})
+    some = Motion(it, "soup.vertex_positions", direction=[1, 0, 0], vertices=range(500))
+    assert str(some).startswith("soup.vertex_positions along (1, 0, 0), vertices 0, 1, 2")
+    assert str(some).endswith("31, ... of 500") and len(str(some)) < 300
