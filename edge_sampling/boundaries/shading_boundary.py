@@ -44,8 +44,9 @@ from .veils import has_veils, is_veil
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
 
-#: Part of the samples that are for emitted light, where both kinds of light may come past an edge.
-EMISSION = 2 / 3
+#: Where both kinds of light may come past edges: how much brighter emitted light is taken to be than scattered light,
+#: and the least part of the samples of each kind.
+EMISSION, LEAST = 16, 0.1
 
 #: How much to prefer edges that stand still, for scattered light at points that stand still: they count only where what
 #: is seen past them moves.
@@ -54,8 +55,10 @@ STILL = 0.2
 #: How much to prefer edges whose faces are both seen, where surfaces that let rays through may be before them.
 VEILED = 0.2
 
-#: Edges from which one is kept, in proportion to what it contributes if nothing hides it.
-CANDIDATES = 4
+#: Edges from which one is kept, in proportion to what it contributes if nothing hides it: where surfaces are matt, and
+#: where any is glossy, since the choice then depends on the direction. The more there are, the less is left of the
+#: stratification of a single one.
+CANDIDATES, IN_GLOSS = 2, 4
 
 
 class ShadingBoundary:
@@ -190,7 +193,8 @@ class ShadingBoundary:
                 turn = dr.rsqrt(r2) * self.silhouettes.preferred(e, use)
                 return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
 
-            e, emission = _chosen(candidate, choice, emission, scattering, sampler)
+            number = IN_GLOSS if self.glossy else CANDIDATES if tracer.scatters(2) else 1
+            e, emission = _chosen(candidate, number, choice, emission, scattering, sampler)
             e.density *= dr.select(emission, p_light, 1)
             division = _either(emission, to_lamp, to_surface)
         return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, division)
@@ -411,17 +415,18 @@ def _either(emitted: mi.Bool, to_lamp: Division, to_surface: Division) -> Divisi
 
 
 def _chosen(
-    candidate: Callable, choice: mi.Float, emission: mi.Bool, scattering: mi.Bool, sampler: mi.Sampler
+    candidate: Callable, number: int, choice: mi.Float, emission: mi.Bool, scattering: mi.Bool, sampler: mi.Sampler
 ) -> tuple[EdgeSample, mi.Bool]:
-    """Of a few candidates one: for emitted light, or for scattered light. If there are both, a reservoir of each takes
-    half of the candidates, and one of the two is kept. And is it for emitted light?
+    """Of a number of candidates one: for emitted light, or for scattered light. If there are both, a reservoir of each
+    takes half of the candidates, and one of the two is kept. And is it for emitted light?
 
-    candidate : makes one, given a uniform number, the kind of light, and a mask. choice : uniform in [0, 1); the
+    candidate : makes one, given a uniform number, the kind of light, and a mask. number : even, but for one kind alone.
+    choice : uniform in [0, 1); the
     numbers of each kind are stratified by it.
     """
-    active, half = emission | scattering, CANDIDATES // 2
+    active, half = emission | scattering, number // 2
     both = emission & scattering
-    count = dr.select(both, mi.Float(half), CANDIDATES)
+    count = dr.select(both, mi.Float(half), number)
 
     def look(k, emitted, scattered, sampler):
         is_emitted = emission & (~scattering | (k < half))
@@ -432,12 +437,13 @@ def _chosen(
     width = dr.width(active)
     _, emitted, scattered, _ = dr.while_loop(
         (dr.zeros(mi.UInt32, width), dr.zeros(Reservoir, width), dr.zeros(Reservoir, width), sampler),
-        lambda k, *_: active & (k < CANDIDATES),
+        lambda k, *_: active & (k < number),
         look,
         label="candidates",
     )
-    p = dr.select(scattered.total > 0, EMISSION, mi.Float(1))
-    p = dr.select(emitted.total > 0, p, 0)
+    brightness = EMISSION * emitted.total
+    p = dr.clip(brightness / (brightness + scattered.total), LEAST, 1 - LEAST)
+    p = dr.select(emitted.total > 0, dr.select(scattered.total > 0, p, 1), 0)
     for_emission = sampler.next_1d(active) < p
     e = dr.select(for_emission, emitted, scattered).kept(count)
     e.density *= dr.select(for_emission, p, 1 - p)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import operator
 from collections.abc import Sequence
 from functools import reduce
-from itertools import product
 from typing import Any
 
 import drjit as dr
@@ -130,6 +129,7 @@ class EdgeIntegrator(ADIntegrator):
                 made = [forward(make) for term, own in part.each for make in term.samples(own)]
                 images.append(self._develop(part.sensor.film(), *zip(*made, strict=True), weights))
                 del made
+                part.walks.clear()
                 dr.eval(images)
             image = reduce(operator.add, images)
         report_image(self.name, image)
@@ -147,6 +147,7 @@ class EdgeIntegrator(ADIntegrator):
             weights = self._weights(passes) if len(passes) > 1 else None
             for part in passes:
                 self._backward(part, grad_in, weights)
+                part.walks.clear()
         report_gradients(self.name, params)
 
     def _backward(self, job: Job, grad_in: mi.TensorXf, weights: mi.ImageBlock | None) -> None:
@@ -342,10 +343,12 @@ class EdgeIntegrator(ADIntegrator):
         job.boundaries.refit()
         passes = self.passes(job)
         weights, images = self._weights(passes), {term.name: 0.0 for term in self.TERMS}
-        for term, part in product(self.TERMS, passes):
-            made = [forward(make) for make in term.samples(part)]
-            samples, values = zip(*made, strict=True) if made else ((), ())
-            images[term.name] += np.array(self._develop(job.sensor.film(), samples, values, weights), np.float64)
+        for part in passes:
+            for term in self.TERMS:
+                made = [forward(make) for make in term.samples(part)]
+                samples, values = zip(*made, strict=True) if made else ((), ())
+                images[term.name] += np.array(self._develop(job.sensor.film(), samples, values, weights), np.float64)
+            part.walks.clear()
         return images
 
     @no_collection()

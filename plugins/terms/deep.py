@@ -8,7 +8,9 @@ import mitsuba as mi
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import DeepShadows
 from rimlight.transport.cut import Cut
-from rimlight.transport.replay import ChosenVertex
+from rimlight.transport.paths import Vertex
+from rimlight.transport.replay import MovingVertex
+from rimlight.transport.walk import Walk
 
 from .points import FromPoints, placement_and_point
 from .term import Job
@@ -17,7 +19,7 @@ from .term import Job
 class DeepShadowsTerm(FromPoints):
     """Edges as vertices of light subpaths see them."""
 
-    name, effort = "shadows in light from surfaces", 3.0
+    name, effort, beyond = "shadows in light from surfaces", 3.0, 1
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0
@@ -28,10 +30,10 @@ class DeepShadowsTerm(FromPoints):
         return job.boundaries.deep
 
     def reflected(
-        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
+        self, job: Job, ray: mi.Ray3f, walk: Walk | Vertex, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, tuple[MovingVertex | Cut, ...]]:
         deep = self.boundary(job)
-        placement, point, cuts = placement_and_point(job, deep.silhouettes, ray, sampler, beyond=1)
+        placement, point, cuts = placement_and_point(job, deep.silhouettes, ray, walk, self.beyond)
         L = deep.at(job.tracer, placement, point, sampler, choice)
         with dr.resume_grad():
             return L * point.β, cuts

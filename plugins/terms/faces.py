@@ -7,7 +7,9 @@ import mitsuba as mi
 
 from rimlight._plan import PlannedTerm
 from rimlight.transport.cut import Cut
-from rimlight.transport.replay import ChosenVertex
+from rimlight.transport.paths import Vertex
+from rimlight.transport.replay import MovingVertex
+from rimlight.transport.walk import Walk
 
 from .points import FromPoints
 from .term import Job
@@ -27,9 +29,9 @@ class FacePlanesTerm(FromPoints):
         return job.boundaries.planes
 
     def reflected(
-        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
-        point, chosen = job.tracer.point(ray, sampler, job.mode)
+        self, job: Job, ray: mi.Ray3f, walk: Walk | Vertex, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, tuple[MovingVertex | Cut, ...]]:
+        point, chosen = job.tracer.point(ray, walk, job.mode)
         L = job.boundaries.planes.sample(job.tracer, point, sampler)
         with dr.resume_grad():
             return L * point.β, () if chosen is None else (chosen,)

@@ -8,7 +8,9 @@ import mitsuba as mi
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import IndirectShadows
 from rimlight.transport.cut import Cut
-from rimlight.transport.replay import ChosenVertex
+from rimlight.transport.paths import Vertex
+from rimlight.transport.replay import MovingVertex
+from rimlight.transport.walk import Walk
 
 from .points import FromPoints, placement_and_point
 from .term import Job
@@ -17,7 +19,7 @@ from .term import Job
 class IndirectShadowsTerm(FromPoints):
     """Edges as the lights see them, and lines of beams, by what jumps there on what lights the vertices of paths."""
 
-    name, effort = "shadows in indirect light", 3.0
+    name, effort, beyond = "shadows in indirect light", 3.0, 1
 
     def planned(self, job: Job) -> PlannedTerm:
         found = self.boundary(job)
@@ -28,18 +30,15 @@ class IndirectShadowsTerm(FromPoints):
     def boundary(self, job: Job) -> tuple[IndirectShadows, ...]:
         return job.boundaries.indirect
 
-    #: How many more vertices there are than that of the path.
-    reach = 1
-
     def sample(self, boundary: IndirectShadows, *arguments) -> mi.Spectrum:
         """See `IndirectShadows.at`."""
         return boundary.at(*arguments)
 
     def reflected(
-        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
+        self, job: Job, ray: mi.Ray3f, walk: Walk | Vertex, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, tuple[MovingVertex | Cut, ...]]:
         boundaries = self.boundary(job)
-        placement, point, cuts = placement_and_point(job, boundaries[0].silhouettes, ray, sampler, beyond=self.reach)
+        placement, point, cuts = placement_and_point(job, boundaries[0].silhouettes, ray, walk, self.beyond)
         L = mi.Spectrum(0)
         for boundary in boundaries:
             of_one = self.sample(boundary, job.tracer, placement, point, sampler, choice)
@@ -52,7 +51,7 @@ class IndirectShadowsTerm(FromPoints):
 class ContinuedShadowsTerm(IndirectShadowsTerm):
     """The same by way of one more vertex, which is found from the shadow."""
 
-    name, reach = "shadows in indirect light, continued", 2
+    name, beyond = "shadows in indirect light, continued", 2
 
     def boundary(self, job: Job) -> tuple[IndirectShadows, ...]:
         return job.boundaries.indirect if job.tracer.scatters(3) else ()

@@ -13,7 +13,9 @@ from rimlight.edge_sampling import Silhouettes, stratified
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.silhouettes import Placement
 from rimlight.transport.cut import Cut
-from rimlight.transport.replay import ChosenVertex
+from rimlight.transport.paths import Vertex
+from rimlight.transport.replay import MovingVertex
+from rimlight.transport.walk import Walk
 
 from .sampling import over_film, seed_of
 from .shadows import nothing_at_points
@@ -21,18 +23,24 @@ from .term import FilmSamples, Job, Sample, Term
 
 
 class FromPoints(Term):
-    """What one vertex of each path sees of boundaries."""
+    """What one vertex of each path sees of boundaries.
+
+    beyond : at least so many more vertices may follow that one.
+    """
+
+    beyond = 0
 
     def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
         return [lambda: self._samples(job)] if self.boundary(job) else []
 
     def _samples(self, job: Job) -> FilmSamples:
+        of_rays, walk = walked(job)
+        ray, ray_weight, position = job.sample_rays(of_rays.clone())
         seed = seed_of(self.name, job.seed)
         sampler, spp = over_film(job.sensor, seed, job.counts.shading)
-        ray, ray_weight, position = job.sample_rays(sampler)
         choice = stratified(sampler, seed)
         rays = Cut(job.mode)
-        L, cuts = self.reflected(job, rays(ray), sampler, choice)
+        L, cuts = self.reflected(job, rays(ray), walk, sampler, choice)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(L * ray_weight * (job.weights / spp)), mi.Float(0))
         return FilmSamples(position, value, ray.wavelengths, 0.0, spp, cuts=(*cuts, rays))
@@ -43,13 +51,27 @@ class FromPoints(Term):
 
     @abstractmethod
     def reflected(
-        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
+        self, job: Job, ray: mi.Ray3f, walk: Walk | Vertex, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, tuple[MovingVertex | Cut, ...]]:
         """What the boundary does to the light along camera rays: mi.Spectrum, (N,), zero, with its gradient; and where
         that is cut, see `FilmSamples`.
 
+        ray : attached to the camera. walk : along these rays.
         choice : uniform in [0, 1), stratified.
         """
+
+
+def walked(job: Job) -> tuple[mi.Sampler, Walk | Vertex]:
+    """Paths from the camera, of which all terms that look from points take the same if they have as many samples: the
+    sampler of their rays, in the state in which `Job.sample_rays` is to have it, and the paths."""
+    spp = job.counts.shading
+    if spp not in job.walks:
+        beyond = {t.beyond for t in job.terms if isinstance(t, FromPoints) and t.boundary(job)}
+        sampler, _ = over_film(job.sensor, seed_of("paths", job.seed), spp)
+        of_rays = sampler.clone()
+        ray, _, _ = job.sample_rays(sampler)
+        job.walks[spp] = of_rays, job.tracer.walk(dr.detach(ray), sampler, sorted(beyond))
+    return job.walks[spp]
 
 
 class PointsTerm(FromPoints):
@@ -70,20 +92,20 @@ class PointsTerm(FromPoints):
         return job.boundaries.shading
 
     def reflected(
-        self, job: Job, ray: mi.Ray3f, sampler: mi.Sampler, choice: mi.Float
-    ) -> tuple[mi.Spectrum, tuple[ChosenVertex | Cut, ...]]:
+        self, job: Job, ray: mi.Ray3f, walk: Walk | Vertex, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[mi.Spectrum, tuple[MovingVertex | Cut, ...]]:
         silhouettes = job.boundaries.shading.silhouettes
-        placement, point, cuts = placement_and_point(job, silhouettes, ray, sampler)
+        placement, point, cuts = placement_and_point(job, silhouettes, ray, walk, self.beyond)
         L = job.boundaries.shading.sample(job.tracer, placement, point, sampler, choice)
         with dr.resume_grad():
             return L * point.β, cuts
 
 
 def placement_and_point(
-    job: Job, silhouettes: Silhouettes, ray: mi.Ray3f, sampler: mi.Sampler, beyond: int = 0
-) -> tuple[Placement, ShadingPoint, tuple[ChosenVertex | Cut, ...]]:
+    job: Job, silhouettes: Silhouettes, ray: mi.Ray3f, walk: Walk | Vertex, beyond: int
+) -> tuple[Placement, ShadingPoint, tuple[MovingVertex | Cut, ...]]:
     """Where the shapes are, a point of each path, as `PathTracer.point` has it, and where both are cut."""
-    find = lambda: job.tracer.point(ray, sampler, job.mode, beyond=beyond)
+    find = lambda: job.tracer.point(ray, walk, job.mode, beyond=beyond)
     # The motion of a chain is found at once, in forward mode: then nothing else may be attached to the shapes yet.
     found = find() if job.tracer.scatters(2) and job.mode == dr.ADMode.Forward else None
     cut = Cut(job.mode)

@@ -15,7 +15,7 @@ from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart, film_parts
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.transport.cut import Cut
-from rimlight.transport.replay import ChosenVertex, Replay
+from rimlight.transport.replay import MovingVertex, Replay
 from rimlight.transport.tracer import PathTracer
 
 from .sampling import Counts, per_pixel, seed_of_pass, size
@@ -61,7 +61,7 @@ class FilmSamples:
     per_pixel: int
     replay: Replay | None = None
     throughput: mi.Spectrum | None = None
-    cuts: tuple[ChosenVertex | Cut, ...] = ()
+    cuts: tuple[MovingVertex | Cut, ...] = ()
 
     def detached(self) -> FilmSamples:
         return replace(self, value=dr.detach(self.value))
@@ -88,6 +88,7 @@ class Job:
     sample_rays : maps a sampler to camera rays, their weights, and film positions in pixels.
     terms : of the derivative, in their order.
     shares : by what the samples of a term are multiplied, by its name; 1 if it is not there.
+    walks : paths that terms share, by their samples per pixel: see `walked`.
     """
 
     tracer: PathTracer
@@ -99,6 +100,7 @@ class Job:
     mode: dr.ADMode = dr.ADMode.Primal
     terms: tuple[Term, ...] = ()
     shares: dict[str, float] = field(default_factory=dict)
+    walks: dict[int, Any] = field(default_factory=dict)
 
     @property
     def each(self) -> list[tuple[Term, Job]]:
@@ -122,7 +124,7 @@ class Job:
         if number == 1:
             return [self]
         of_each = self.counts.part(number)
-        return [replace(self, counts=of_each, seed=seed_of_pass(self.seed, i)) for i in range(number)]
+        return [replace(self, counts=of_each, seed=seed_of_pass(self.seed, i), walks={}) for i in range(number)]
 
     @cached_property
     def parts(self) -> list[FilmPart]:

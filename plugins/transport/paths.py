@@ -1,8 +1,8 @@
-"""Paths beyond their first vertex: the light that arrives along them, and the choice of one vertex."""
+"""Paths beyond their first vertex: the light that arrives along them, and the choice of vertices."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -99,38 +99,53 @@ def scattered_light(
     return dr.while_loop(state, lambda *state: state[-2], bounce, label="scattered light")[:2]
 
 
-def choose_vertex(
+@dataclass
+class Choice:
+    """One vertex of each path, chosen in proportion to its throughput. (A Dr.Jit structure: not frozen.)
+
+    depth : mi.UInt32, its number along the path.
+    β : mi.Spectrum, throughput up to it, over its probability.
+    active : mi.Bool, is there one?
+    since : mi.UInt32, number of the last vertex up to there that does not slide with those before; 1 if all do.
+    before : mi.UInt32, the same of the vertex before.
+    density : mi.Float, by area, with which it was found from the vertex before; infinite if that is a mirror.
+    """
+
+    depth: mi.UInt32
+    β: mi.Spectrum
+    active: mi.Bool
+    since: mi.UInt32
+    before: mi.UInt32
+    density: mi.Float
+
+
+def choose_vertices(
     scene: mi.Scene,
     sampler: mi.Sampler,
     vertex: Vertex,
     depths: Depths,
     vicinity: Vicinity,
     active: mi.Bool,
+    beyond: Sequence[int],
     note: Callable[[Vertex, Numbers, Next, mi.Bool], None],
-) -> tuple[Vertex, mi.Bool, mi.UInt32, mi.UInt32, mi.Float]:
-    """Follow paths from their first vertex, and keep one vertex of each, in proportion to its throughput (a reservoir
-    of one); its β is divided by its probability.
+) -> list[Choice]:
+    """Follow paths from their first vertex, and keep vertices of each, in proportion to its throughput (reservoirs of
+    one): one for each number in `beyond`, which at least so many vertices may follow.
 
     note : called with each vertex, its random numbers, and the next one.
-
-    Returns
-    -------
-    vertex : with a ray that is detached.
-    chosen : mi.Bool, is there one?
-    since : mi.UInt32, number of the last vertex up to there that does not slide with those before; 1 if all do.
-    before : mi.UInt32, the same of the vertex before.
-    density : mi.Float, by area, with which it was found from the vertex before; infinite if that is a mirror.
     """
 
-    def bounce(total, kept, kept_since, kept_before, kept_density, vertex, since, before, density, active, sampler):
+    def bounce(totals, kept, vertex, since, before, density, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         bsdf = si.bsdf(vertex.ray)
-        w = dr.select(active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth), dr.max(vertex.β), 0)
-        total += w
-        taken = sampler.next_1d(active) * total < w
-        kept, kept_since = dr.select(taken, vertex, kept), dr.select(taken, since, kept_since)
-        kept_before = dr.select(taken, before, kept_before)
-        kept_density = dr.select(taken, density * dr.abs_dot(si.n, vertex.ray.d), kept_density)
+        scatters = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        here = Choice(vertex.depth, vertex.β, mi.Bool(True), since, before, density * dr.abs_dot(si.n, vertex.ray.d))
+        number = sampler.next_1d(active)
+        totals, kept = list(totals), list(kept)
+        for i, more in enumerate(beyond):
+            w = dr.select(scatters & depths.scatters(vertex.depth + more), dr.max(vertex.β), 0)
+            totals[i] = totals[i] + w
+            kept[i] = dr.select(number * totals[i] < w, here, kept[i])
         numbers = Numbers(mi.Point2f(0), sampler.next_1d(active), sampler.next_2d(active))
         bs, onwards = next_vertex(scene, si, bsdf, numbers, active & depths.scatters(vertex.depth + 1), vicinity)
         note(vertex, numbers, onwards, active)
@@ -139,18 +154,24 @@ def choose_vertex(
         before, since = since, dr.select(slides, since, vertex.depth + 1)
         density = dr.select(onwards.mirrored, dr.inf, bs.pdf / r2)
         vertex, active = step(vertex, onwards, sampler, depths, active)
-        return total, kept, kept_since, kept_before, kept_density, vertex, since, before, density, active, sampler
+        return totals, kept, vertex, since, before, density, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
     width = dr.width(vertex.depth)
     one, zero = dr.full(mi.UInt32, 1, width), dr.zeros(mi.Float, width)
-    none = mi.Float(zero), vertex, one, mi.UInt32(one), mi.Float(zero)
-    first = vertex, mi.UInt32(one), mi.UInt32(one), mi.Float(zero)
-    total, kept, since, before, density, *_ = dr.while_loop(
-        (*none, *first, active, sampler), lambda *state: state[-2], bounce, label="choice of a vertex"
+    kept = [dr.zeros(Choice, width) for _ in beyond]
+    for choice in kept:
+        choice.depth = mi.UInt32(one)
+    first = vertex, mi.UInt32(one), mi.UInt32(one), zero
+    totals, kept, *_ = dr.while_loop(
+        ([mi.Float(zero) for _ in beyond], kept, *first, active, sampler),
+        lambda *state: state[-2],
+        bounce,
+        label="choice of vertices",
     )
-    kept.β *= dr.select(total > 0, total / dr.max(kept.β), 0)
-    return kept, total > 0, since, before, density
+    for total, choice in zip(totals, kept, strict=True):
+        choice.β *= dr.select(choice.active, total / dr.max(choice.β), 0)
+    return kept
 
 
 def step(vertex, onwards, sampler, depths, active):

@@ -17,11 +17,11 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight, axis_of
-from rimlight.edge_sampling.parametrisation import Slides, Vicinity, look_from, seen_by_camera, sliding_point
+from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
 from rimlight.edge_sampling.refusals import Refusal
 
 from .log import Log
-from .paths import Depths, Vertex, choose_vertex, step
+from .paths import Depths, Vertex, step
 from .scattering import Numbers, Scattering, next_vertex
 
 #: Longest path of which a table is made without counting its vertices before.
@@ -221,7 +221,7 @@ class MovingVertex:
     ray : camera rays, attached to the camera.
     first : the vertex that they meet.
     log : the path up to it; and one vertex more, if `onwards`.
-    vertex, active, since : see `choose_vertex`.
+    vertex, active : the vertex of each path, and is there one? since : see `Choice`.
     onwards : is the direction to the vertex beyond wanted, too? It is `d`, with gradients of its own.
     lamps : see `Chain`. With the lobes of the vertices, directions are `turning`, with gradients of their own.
     before : as `since`, of the vertex before, which looks at this one. Only needed with `lamps`.
@@ -368,44 +368,6 @@ class MovingVertex:
             value += dr.select(chained & ~at_first, dr.dot(δo, start.o), 0)
             value += dr.select(chained, dr.dot(to_first, start.d), 0)
             dr.backward_from(value, flags=FLAGS)
-
-
-class ChosenVertex(MovingVertex):
-    """One vertex of each path, chosen in proportion to its throughput, as it moves.
-
-    sampler : of the paths.
-    slides : see `Vicinity`. lamps : see `Chain`.
-    """
-
-    def __init__(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        first: Vertex,
-        depths: Depths,
-        mode: dr.ADMode,
-        slides: Slides,
-        lamps: DividedLight | None = None,
-    ):
-        vicinity = Vicinity.of(first.pi, slides)
-        chain = Chain(scene, vicinity)
-
-        def follow(log):
-            def note(vertex, numbers, onwards, active):
-                if log is not None:
-                    if chain.scattering.any_mirror:
-                        log.leave(vertex.depth, vertex.β, numbers, active)
-                    log.arrive(vertex.depth + 1, onwards, active)
-
-            random = sampler if log is not None else sampler.clone()
-            chosen = choose_vertex(scene, random, first, depths, vicinity, first.pi.is_valid(), note)
-            random.schedule_state()
-            return chosen
-
-        log, chosen = written(scene, first.ray, 1, depths, follow, lambda chosen: chosen[0].depth)
-        vertex, active, since, before, self.density = chosen
-        super().__init__(chain, ray, first, log, vertex, active, since, mode, lamps=lamps, before=before)
 
 
 def written(

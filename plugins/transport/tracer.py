@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +18,9 @@ from rimlight.edge_sampling.parametrisation import Slides, Vicinity, seen_by_cam
 from rimlight.edge_sampling.rays import spawn_ray
 
 from .paths import Depths, Vertex, scattered_light
-from .replay import ChosenVertex, Replay, Start
+from .replay import MovingVertex, Replay, Start
 from .scattering import Scattering
+from .walk import Walk
 
 
 @dataclass
@@ -167,27 +169,36 @@ class PathTracer:
 
     # ---------------------- From points of a path ----------------------
 
+    def walk(self, ray: mi.Ray3f, sampler: mi.Sampler, beyond: Sequence[int]) -> Walk | Vertex:
+        """Paths along camera rays, with vertices for `point`: one for each number in `beyond`. If none reflects light
+        of other surfaces: what the rays meet."""
+        first = camera_vertex(ray, self.first_hit(ray, True))
+        if not self.scatters(2):
+            return first
+        return Walk(self.scene, sampler, first, self.depths, self.slides, beyond)
+
     def point(
-        self, ray: mi.Ray3f, sampler: mi.Sampler, mode: dr.ADMode, *, beyond: int = 0
-    ) -> tuple[ShadingPoint, ChosenVertex | None]:
+        self, ray: mi.Ray3f, walk: Walk | Vertex, mode: dr.ADMode, *, beyond: int = 0
+    ) -> tuple[ShadingPoint, MovingVertex | None]:
         """One vertex of each path at which light is scattered; and what hands its gradient on in backward mode, if that
         does not go by itself.
 
-        beyond : at least so many more vertices may follow it.
+        ray : camera rays, attached to the camera. walk : along these.
+        beyond : at least so many more vertices may follow it. If it is 0, it is known with what directions turn there.
         """
-        pi = self.first_hit(ray, True)
-        vertex = camera_vertex(ray, pi)
-        if not self.scatters(2):
+        lamps = self.lamps if beyond == 0 else None
+        if not isinstance(walk, Walk):
+            pi = walk.pi
             si, no = seen_by_camera(self.scene, ray, pi, pi.is_valid(), attached=True), mi.Bool(False)
             still, turning = Vicinity(mi.Float(0)), None
-            if self.lamps is not None:
+            if lamps is not None:
                 with dr.resume_grad():
-                    turning = self.lamps.turning(si, si.bsdf(), pi.is_valid())
-            return ShadingPoint(si, vertex.depth, vertex.β, pi.is_valid(), no, still, mi.Float(0), turning), None
-        depths = replace(self.depths, max_depth=self.depths.max_depth - beyond)
-        c = ChosenVertex(self.scene, sampler, ray, vertex, depths, mode, self.slides, self.lamps)
+                    turning = lamps.turning(si, si.bsdf(), pi.is_valid())
+            return ShadingPoint(si, walk.depth, walk.β, pi.is_valid(), no, still, mi.Float(0), turning), None
+        chosen = walk.choice(beyond)
+        c = walk.vertex(chosen, ray, mode, lamps)
         moves = c.since < c.depth, c.vicinity
-        return ShadingPoint(c.si, c.depth, c.vertex.β, c.active, *moves, c.density, c.turning), c
+        return ShadingPoint(c.si, c.depth, chosen.β, c.active, *moves, chosen.density, c.turning), c
 
     def scattered(
         self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None
