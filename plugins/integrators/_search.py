@@ -118,7 +118,7 @@ class BoundarySearch:
         if not self._checked:
             # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
             self._refuse_while_recording()
-        key = (*moving.key, sppi > 0)
+        key = (*moving.key, sppi > 0, self.depths)
         if key not in self._boundaries:
             self._refuse_while_recording()
             self._boundaries[key] = self._find(scene, moving, sppi)

@@ -118,6 +118,7 @@ class RigIntegrator(EdgeIntegrator):
     """
 
     OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "min_depth", "rr_depth", "lights_per_path")
+    LONGEST = LONGEST
     PLANES = False
     FROM_POINTS = False
     BALANCES = False

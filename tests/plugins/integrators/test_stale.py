@@ -225,6 +225,19 @@ def test_a_texture_that_comes_to_jump(kind):
     assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
 
 
+@pytest.mark.parametrize("kind", ["prb_edge", "bdpt_edge", "rig"])
+def test_depths_are_set_between_two_steps(kind):
+    """As scripts do, so that paths become longer in the course of an optimisation."""
+    lamp = {"type": "point", "position": [1, 4, -2], "intensity": 20.0}
+    scene, used = lit(shared_meshes(), lamp), mi.load_dict({"type": kind, "max_depth": 2})
+    before = derivative(scene, used, "cube.vertex_positions")
+    used.max_depth = 3
+    after = assert_as_fresh(scene, used, lambda: mi.load_dict({"type": kind, "max_depth": 3}), "cube.vertex_positions")
+    assert np.abs(after - before).sum() > 0.05 * np.abs(before).sum()
+    image = lambda it: np.array(mi.render(scene, integrator=it, spp=4), np.float64)
+    np.testing.assert_allclose(image(used), image(mi.load_dict({"type": kind, "max_depth": 3})), atol=1e-5)
+
+
 # ---------------------- Several scenes ----------------------
 
 
