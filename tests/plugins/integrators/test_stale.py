@@ -12,6 +12,7 @@ import mirrors
 import mitsuba as mi
 import numpy as np
 import pytest
+from other_textures import TEXTURES
 
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import find_welded_edges
@@ -222,6 +223,19 @@ def test_a_texture_that_comes_to_jump(kind):
     params[key] = value
     params.update()
     after = assert_as_fresh(scene, used, direct_edge, "board.to_world")
+    assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
+
+
+@pytest.mark.parametrize("what", TEXTURES)
+def test_textures_jump_at_other_places(what):
+    make_scene, key, value = TEXTURES[what]
+    scene, used = make_scene(), direct_edge()
+    params = mi.traverse(scene)
+    moves = "board.vertex_positions" if "board.vertex_positions" in params else "cube.vertex_positions"
+    before = derivative(scene, used, moves)
+    params[key] = value(params[key])
+    params.update()
+    after = assert_as_fresh(scene, used, direct_edge, moves)
     assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
 
 
