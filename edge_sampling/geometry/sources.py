@@ -3,8 +3,8 @@
 Edges are found on the host, which takes seconds for a million of them; an optimisation step takes milliseconds. So they
 are kept as long as what they were derived from stays as it was: which shapes, materials and lights there are, their
 faces, which vertices lie at the same place, and where attributes differ between those; which beams end with a jump,
-which textures are even, and where those have their texels. Vertices may move, as long as none of them part, and none meet, and the vertex normals of flat
-faces stay theirs.
+which textures are even, and where they have their texels. Vertices may move, as long as none of them part, and none
+meet, and the vertex normals of flat faces stay theirs.
 """
 
 from __future__ import annotations
