@@ -131,6 +131,8 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The image, as Mitsuba has it."""
+        sensor = self._sensor(scene, sensor)
+        self._rendered.remember(scene, sensor, seed)
         around = self._around if dr.flag(dr.JitFlag.FreezingScope) else None
         return render(self, scene, sensor, seed, spp, develop, around=around)
 

@@ -29,6 +29,7 @@ from ._balance import RUNS, Balance, balanced
 from ._depths import attribute, checked_depths
 from ._finite import report_gradients, report_image, values_of
 from ._options import check_options, is_whole
+from ._rendered import CHANGED, Rendered
 from ._search import BoundarySearch
 
 
@@ -100,6 +101,7 @@ class EdgeIntegrator(ADIntegrator):
         self.shares: dict[str, float] = {}
         #: Most samples of a term that a derivative has in memory at once. See `passes`.
         self.at_once: int = AT_ONCE[dr.backend_v(mi.Float)]
+        self._rendered = Rendered()
         self._warned: set[str] = set()
 
     def _sample_count(self, props: mi.Properties, key: str) -> int | None:
@@ -117,6 +119,8 @@ class EdgeIntegrator(ADIntegrator):
     @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The image, as Mitsuba has it."""
+        sensor = self._sensor(scene, sensor)
+        self._rendered.remember(scene, sensor, seed)
         return super().render(scene, sensor, seed, spp, develop, evaluate)
 
     @no_collection()
@@ -270,6 +274,8 @@ class EdgeIntegrator(ADIntegrator):
     def job(self, scene, sensor, seed=0, spp=0, mode=dr.ADMode.Primal) -> Job:
         """A derivative with respect to the parameters that carry a gradient now. Warns of what it will lack."""
         sensor = self._sensor(scene, sensor)
+        if self._rendered.has_changed(scene, sensor, seed):
+            self._warn([CHANGED])
         counts = self._counts(sensor, spp)
         boundaries = self._boundaries(scene, sensor, counts.shading)
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
