@@ -16,6 +16,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import drjit as dr
+import mitsuba as mi
+
+THREADS = (
+    "two threads differentiate at the same time. Dr.Jit looks at the objects of all scenes of a process, so gradients "
+    "may be wrong, or errors may be raised, even if each thread has a scene of its own. Use processes, or one thread."
+)
 
 
 class _Collector:
@@ -26,10 +32,15 @@ class _Collector:
         self.guards = 0
         self.enabled = False
         self.set_aside = False
+        #: The thread that came in first; and was the user told that a second one came?
+        self.owner = 0
+        self.told = False
 
     def off(self) -> None:
+        self._tell()
         with self.lock:
             if not self.guards:
+                self.owner = threading.get_ident()
                 self.enabled = gc.isenabled()
                 gc.disable()
                 if self.set_aside and not dr.flag(dr.JitFlag.FreezingScope):
@@ -52,6 +63,14 @@ class _Collector:
                 gc.freeze()
                 self.set_aside = True
             gc.enable()
+
+    def _tell(self) -> None:
+        """Say once that threads mix."""
+        with self.lock:
+            mixed = self.guards and threading.get_ident() != self.owner and not self.told
+            self.told |= bool(mixed)
+        if mixed:
+            mi.Log(mi.LogLevel.Warn, THREADS)
 
     def collect(self) -> None:
         with self.lock:

@@ -2,9 +2,9 @@
 
 Edges are found on the host, which takes seconds for a million of them; an optimisation step takes milliseconds. So they
 are kept as long as what they were derived from stays as it was: which shapes, materials and lights there are, their
-faces, which vertices lie at the same place, and where attributes differ between those; which beams end with a jump, and
-which textures are even. Vertices may move, as long as none of them part, and none meet, and the vertex normals of flat
-faces stay theirs.
+faces, which vertices lie at the same place, and where attributes differ between those; which beams end with a jump,
+which textures are even, and where they have their texels. Vertices may move, as long as none of them part, and none
+meet, and the vertex normals of flat faces stay theirs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .meshes import (
     vertex_attributes,
 )
 from .parameters import Parameter
-from .texture_lines import is_even, texture_values
+from .texture_lines import is_even, numbers_of_place, texture_values
 
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
 APART = 64
@@ -215,7 +215,8 @@ def _coincide(positions: mi.Float, vertices: mi.UInt32) -> mi.Bool:
 
 
 def _objects(scene: mi.Scene, found: list[Parameter], geometry: Geometry) -> tuple[list[Any], list[Any]]:
-    """All shapes, materials, textures, lights and media; and the numbers that tell what they are."""
+    """All shapes, materials, textures, lights and media; and the numbers that tell what they are, and where textures
+    may jump."""
     shapes, emitters = scene.shapes(), scene.emitters()
     bsdfs = [s.bsdf() for s in shapes]
     kinds = (mi.Shape, mi.BSDF, mi.Emitter, mi.Texture, mi.Medium)
@@ -223,6 +224,7 @@ def _objects(scene: mi.Scene, found: list[Parameter], geometry: Geometry) -> tup
     numbers = [(m.vertex_count(), m.face_count(), has_interpolated_normals(m)) for m in geometry.meshes]
     numbers += [b.flags() for b in bsdfs if b is not None]
     numbers += [(e.flags(), getattr(e, "light_count", 1)) for e in emitters]
+    numbers += [numbers_of_place(p.name, p.value) for p in found if isinstance(p.node, mi.Texture)]
     return [*shapes, *emitters, *bsdfs, *nodes], [*numbers, *(p.name for p in found)]
 
 

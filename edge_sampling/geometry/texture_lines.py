@@ -181,7 +181,7 @@ def lines_of_beam(light: mi.Emitter) -> list[Any]:
 def _lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
     """Of the textures of a shape, or of a light, that jump."""
     of_mesh = isinstance(shape, mi.Mesh) and has_texcoords(shape)
-    uv = np.concatenate([[[0, 0], [1, 1]], texture_coordinates(shape) if of_mesh else np.zeros((0, 2))])
+    uv = texture_coordinates(shape) if of_mesh else np.zeros((0, 2))
     found = []
     below = objects_below(shape)
     bumps = [below.get(f"{name}.nested_texture") for name, o in below.items() if o.class_name() == "BumpMap"]
@@ -195,7 +195,7 @@ def _lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
             # Slopes jump in the middle of texels. GPUs may take a place close to it for one on the other side.
             step = TEXTURE_UNIT_STEP if _in_steps(o) else 0.0
             found.append(Lattice(matrix - [[0, 0, 0.5], [0, 0, 0.5]], light, step))
-        elif _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()):
+        elif _jumps(o, *_range(o, uv)):
             found.append(Lattice(matrix, light))
     return found
 
@@ -212,7 +212,7 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
     known = [k for k, o in below(besides).items() if o.class_name() != VOLUME]
     box = scene.bbox()
     uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if has_texcoords(m)]
-    uv = np.concatenate([[[0, 0], [1, 1]], *uv])
+    uv = np.concatenate([np.zeros((0, 2)), *uv])
     return [
         f'"{name}" ({o.class_name().partition("TextureImpl")[0]})'
         for name, o in objects_below(scene).items()
@@ -220,7 +220,7 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
         and id(o) not in known
         and (
             (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
-            or (has_place(o) and _jumps(o, uv.min(0).tolist(), uv.max(0).tolist()))
+            or (has_place(o) and _jumps(o, *_range(o, uv)))
             or (o.class_name() == VOLUME and box.valid() and _jumps(o, list(box.min), list(box.max)))
         )
     ]
@@ -249,9 +249,7 @@ def _in_steps(texture: mi.Texture) -> bool:
     random = np.random.default_rng(0)
     corners = random.integers(0, np.minimum(size, FIRST_TEXELS), (TEXELS, 2)) + random.uniform(0.1, 0.9, (TEXELS, 2))
     apart = TEXTURE_UNIT_STEP / PLACES_OF_STEP * np.arange(2 * PLACES_OF_STEP + 1)
-    places = (corners[:, None] + apart[:, None]) / size
-    to_uv = np.array(mi.traverse(texture)["to_uv"].matrix, float)
-    uv = (places.reshape(-1, 2) - to_uv[:2, 2]) @ np.linalg.pinv(to_uv[:2, :2]).T
+    uv = _from_texture(texture, ((corners[:, None] + apart[:, None]) / size).reshape(-1, 2))
     with dr.suspend_grad():
         values = np.array(_value(texture, mi.Point2f(uv.T.astype(np.float32)))).reshape(-1, TEXELS, len(apart))
     same = (np.diff(values, axis=2) == 0).all(0)  # in all channels
@@ -278,6 +276,14 @@ def is_even(texture: mi.Texture) -> bool:
     colours = [np.array(dr.detach(v)) for v in _colours(texture)]
     rows = [v.reshape(-1, v.shape[-1] if v.ndim == 3 else v.size) for v in colours]
     return all(r.shape[1] == rows[0].shape[1] and (r == rows[0][0]).all() for r in rows)
+
+
+def numbers_of_place(name: str, value: Any) -> list[Any]:
+    """What a parameter of a texture tells of where its texels are: its resolution, or the map from texture
+    coordinates."""
+    if name.endswith("data"):
+        return list(value.shape)
+    return np.array(value.matrix).tolist() if name.endswith("to_uv") else []
 
 
 def _colours(texture: mi.Texture) -> list[Any]:
@@ -319,8 +325,19 @@ def _brightest_and_darkest(texture: mi.Texture) -> np.ndarray:
     data = np.array(dr.detach(params["data"])).sum(2)
     y, x = np.unravel_index([data.argmax(), data.argmin()], data.shape)
     u, v = (x + 0.5) / data.shape[1], (y + 0.5) / data.shape[0]
-    places = np.stack([np.stack([u, w], -1) for w in (v, 1 - v)])
-    to_uv = np.array(params["to_uv"].matrix, float)
+    return _from_texture(texture, np.stack([np.stack([u, w], -1) for w in (v, 1 - v)]))
+
+
+def _range(texture: mi.Texture, uv: np.ndarray) -> tuple[list[float], list[float]]:
+    """The least and the largest texture coordinates at which a texture is looked at: those of a mesh, (V, 2), and those
+    of the whole texture, since the mesh may come to show other parts of it."""
+    uv = np.concatenate([[[0, 0], [1, 1]], _from_texture(texture, np.array([[0, 0], [0, 1], [1, 0], [1, 1]])), uv])
+    return uv.min(0).tolist(), uv.max(0).tolist()
+
+
+def _from_texture(texture: mi.Texture, places: np.ndarray) -> np.ndarray:
+    """The texture coordinates of places in a texture, from 0 to 1: (..., 2) both."""
+    to_uv = np.array(mi.traverse(texture)["to_uv"].matrix, float)
     return (places - to_uv[:2, 2]) @ np.linalg.pinv(to_uv[:2, :2]).T
 
 

@@ -55,6 +55,9 @@ from ._limits import Media, Moving, PartialParameters, is_mirror, lasting_limits
 #: Parameters of a light that move the shadows in it, or the border of its beam.
 PLACE_OF_LIGHT = ("position", "to_world", "directions", "angular_radius", "sun_direction", "cutoff_angle")
 
+#: Sensors at most of which it is remembered what their clipping planes cut. Each of them keeps its film in memory.
+SENSORS = 16
+
 
 class BoundarySearch:
     """Finds the boundaries that can contribute to a derivative. Edges are kept as long as what they were derived from
@@ -118,7 +121,7 @@ class BoundarySearch:
         if not self._checked:
             # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
             self._refuse_while_recording()
-        key = (*moving.key, sppi > 0)
+        key = (*moving.key, sppi > 0, self.depths)
         if key not in self._boundaries:
             self._refuse_while_recording()
             self._boundaries[key] = self._find(scene, moving, sppi)
@@ -315,6 +318,8 @@ class BoundarySearch:
         """What the derivative will lack as seen from this sensor. Found once, since it looks at positions."""
         key = (id(sensor), moving.flags, moving.camera)
         if key not in self._beyond and not dr.flag(dr.JitFlag.FreezingScope):
-            # With the sensor, so that its number is given to no other one.
+            # With the sensor, so that its number is given to no other one. Not all: scripts make one for each step.
             self._beyond[key] = sensor, cut_by_clipping_planes(sensor, list(moving.on_film))
+            if len(self._beyond) > SENSORS:
+                del self._beyond[next(iter(self._beyond))]
         return self._beyond[key][1] if key in self._beyond else []

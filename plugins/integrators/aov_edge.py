@@ -174,6 +174,7 @@ class AOVEdgeIntegrator(EdgeIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The images of the nested integrators, and the channels behind them: mi.TensorXf, (H, W, C)."""
         sensor = self._sensor(scene, sensor)
+        self._rendered.remember(scene, sensor, seed)
         images = [i.render(scene, sensor, seed, spp, develop, evaluate) for i in self.nested.values()]
         with dr.suspend_grad():
             sampler, spp = over_film(sensor, seed, spp or sensor.sampler().sample_count())

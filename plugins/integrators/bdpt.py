@@ -9,6 +9,7 @@ from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.transport.paths import Depths
 
 from ._bidirectional_image import light_paths_of, render
+from ._depths import attribute, checked_depths
 from ._options import check_options, is_whole
 
 
@@ -78,23 +79,21 @@ class BDPTIntegrator(ADIntegrator):
     """
 
     OPTIONS = ("max_depth", "rr_depth", "light_paths", "spp_per_pass", "hide_emitters")
+    LONGEST = None
+
+    depths: Depths | None = None
+    max_depth, rr_depth = attribute("max_depth"), attribute("rr_depth")
 
     def __init__(self, props: mi.Properties):
         check_options(props, self.OPTIONS)
         self.name = props.plugin_name()
-        max_depth, rr_depth = props.get("max_depth", 6), props.get("rr_depth", 5)
+        depths = checked_depths(self.name, props.get("max_depth", 6), props.get("rr_depth", 5))
         per_pass = props.get("spp_per_pass", None)
-        if not is_whole(max_depth) or max_depth < -1:
-            raise InputError(
-                f'{self.name}: "max_depth" must be a whole number >= 0, or -1 for no limit, got {max_depth}'
-            )
-        if not is_whole(rr_depth) or rr_depth < 1:
-            raise InputError(f'{self.name}: "rr_depth" must be a whole number >= 1, got {rr_depth}')
         if per_pass is not None and (not is_whole(per_pass) or per_pass < 1):
             raise InputError(f'{self.name}: "spp_per_pass" must be a whole number >= 1, got {per_pass}')
         self.light_paths = light_paths_of(props)
         super().__init__(props)
-        self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
+        self.depths = depths
         self.per_pass = per_pass
         #: Numbers of vertices from the light and from the camera of the paths that are rendered; None: any.
         self.ways: tuple[int | None, int | None] = (None, None)

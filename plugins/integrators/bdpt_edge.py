@@ -8,7 +8,6 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.refusals import InputError
 from rimlight.terms.bidirectional import BidirectionalTerm
 from rimlight.terms.deep import DeepShadowsTerm
 from rimlight.terms.indirect import ContinuedShadowsTerm
@@ -88,6 +87,7 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
 
     OPTIONS = (*prb_edge.PRBEdgeIntegrator.OPTIONS, "light_paths")
     FROM_SURFACES = True
+    LONGEST = LONG
     TRACER = BidirectionalTracer
     TERMS = (BidirectionalTerm(), *TERMS[1:], DeepShadowsTerm(), ContinuedShadowsTerm())
 
@@ -95,8 +95,6 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
         super().__init__(props)
         self.light_paths, self.limits = light_paths_of(props), BidirectionalLimits()
         self._around: Around | None = None
-        if self.depths.max_depth > LONG:
-            raise InputError(f'{self.name}: "max_depth" must be at most {LONG}, got {props.get("max_depth")}')
 
     def job(self, scene, sensor, seed=0, spp=0, mode=dr.ADMode.Primal) -> Job:
         """As that of `EdgeIntegrator`.
@@ -133,6 +131,8 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The image, as Mitsuba has it."""
+        sensor = self._sensor(scene, sensor)
+        self._rendered.remember(scene, sensor, seed)
         around = self._around if dr.flag(dr.JitFlag.FreezingScope) else None
         return render(self, scene, sensor, seed, spp, develop, around=around)
 

@@ -25,8 +25,10 @@ from rimlight.transport.paths import Depths
 from rimlight.transport.tracer import PathTracer
 
 from ._balance import RUNS, Balance, balanced
+from ._depths import attribute, checked_depths
 from ._finite import report_gradients, report_image, values_of
 from ._options import check_options, is_whole
+from ._rendered import CHANGED, Rendered
 from ._search import BoundarySearch
 
 
@@ -43,6 +45,12 @@ class EdgeIntegrator(ADIntegrator):
 
     #: Names of the properties. Subclasses that have more extend them.
     OPTIONS: tuple[str, ...] = ("sppc", "sppp", "sppi", "hide_emitters")
+
+    #: The longest paths that it can trace; None: there are no longest ones.
+    LONGEST: int | None = None
+
+    depths: Depths | None = None
+    max_depth, rr_depth = attribute("max_depth"), attribute("rr_depth")
 
     #: Properties that are accepted, but have no effect.
     IDLE: tuple[str, ...] = ()
@@ -79,9 +87,10 @@ class EdgeIntegrator(ADIntegrator):
 
     def __init__(self, props: mi.Properties, max_depth: int = 2, rr_depth: int = 5):
         check_options(props, self.OPTIONS, self.IDLE)
-        super().__init__(props)
-        self.depths = Depths(max_depth if max_depth >= 0 else 0xFFFFFFFF, rr_depth)
         self.name = props.plugin_name()
+        depths = checked_depths(self.name, max_depth, rr_depth, self.LONGEST)
+        super().__init__(props)
+        self.depths = depths
         if mi.is_polarized:
             raise InputError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
@@ -91,6 +100,7 @@ class EdgeIntegrator(ADIntegrator):
         self.shares: dict[str, float] = {}
         #: Most samples of a term that a derivative has in memory at once. See `passes`.
         self.at_once: int = AT_ONCE[dr.backend_v(mi.Float)]
+        self._rendered = Rendered()
         self._warned: set[str] = set()
 
     def _sample_count(self, props: mi.Properties, key: str) -> int | None:
@@ -108,6 +118,8 @@ class EdgeIntegrator(ADIntegrator):
     @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The image, as Mitsuba has it."""
+        sensor = self._sensor(scene, sensor)
+        self._rendered.remember(scene, sensor, seed)
         return super().render(scene, sensor, seed, spp, develop, evaluate)
 
     @no_collection()
@@ -263,6 +275,8 @@ class EdgeIntegrator(ADIntegrator):
     def job(self, scene, sensor, seed=0, spp=0, mode=dr.ADMode.Primal) -> Job:
         """A derivative with respect to the parameters that carry a gradient now. Warns of what it will lack."""
         sensor = self._sensor(scene, sensor)
+        if self._rendered.has_changed(scene, sensor, seed):
+            self._warn([CHANGED])
         counts = self._counts(sensor, spp)
         boundaries = self._boundaries(scene, sensor, counts.shading)
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
@@ -367,6 +381,7 @@ class EdgeIntegrator(ADIntegrator):
             return self._boundaries(scene, sensor, self._counts(sensor, 0).shading, self.search.prepare)
 
     def _boundaries(self, scene, sensor, sppi, find=None) -> Boundaries:
+        self.search.depths = self.depths
         boundaries = (find or self.search.boundaries)(scene, sensor, sppi)
         self._warn(boundaries.limits)
         return boundaries

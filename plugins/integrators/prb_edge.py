@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from rimlight.edge_sampling.refusals import InputError
-
-from ._options import is_whole
 from .edge_integrator import EdgeIntegrator
 
 
@@ -82,13 +79,7 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth")
 
     def __init__(self, props: mi.Properties):
-        who = props.plugin_name()
-        max_depth, rr_depth = props.get("max_depth", 6), props.get("rr_depth", 5)
-        if not is_whole(max_depth) or max_depth < -1:
-            raise InputError(f'{who}: "max_depth" must be a whole number >= 0, or -1 for no limit, got {max_depth}')
-        if not is_whole(rr_depth) or rr_depth < 1:
-            raise InputError(f'{who}: "rr_depth" must be a whole number >= 1, got {rr_depth}')
-        super().__init__(props, max_depth=max_depth, rr_depth=rr_depth)
+        super().__init__(props, max_depth=props.get("max_depth", 6), rr_depth=props.get("rr_depth", 5))
 
 
 mi.register_integrator("prb_edge", PRBEdgeIntegrator)

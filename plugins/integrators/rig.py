@@ -118,6 +118,7 @@ class RigIntegrator(EdgeIntegrator):
     """
 
     OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "min_depth", "rr_depth", "lights_per_path")
+    LONGEST = LONGEST
     PLANES = False
     FROM_POINTS = False
     BALANCES = False
@@ -144,6 +145,7 @@ class RigIntegrator(EdgeIntegrator):
         """The layers: mi.TensorXf, (H, W, 3 K), linear radiance."""
         with dr.suspend_grad():
             sensor = self._sensor(scene, sensor)
+            self._rendered.remember(scene, sensor, seed)
             paths = self._paths(scene)
             sampler, spp = over_film(sensor, seed, spp or sensor.sampler().sample_count())
             ray, weight, u = self.sample_rays(scene, sensor, sampler)

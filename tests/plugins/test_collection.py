@@ -9,6 +9,7 @@ import sys
 import threading
 import weakref
 
+import cases
 import drjit as dr
 import garbage
 import mitsuba as mi
@@ -82,6 +83,24 @@ def test_off_until_the_last_thread_has_left():
     leave.set()
     thread.join(60)
     assert gc.isenabled()
+
+
+def test_threads_that_mix_are_told_once(monkeypatch):
+    """Dr.Jit mixes what they differentiate."""
+    monkeypatch.setattr(_collection._collector, "told", False)
+
+    def guarded():
+        with rimlight.no_collection():
+            pass
+
+    with cases.messages() as said, rimlight.no_collection():
+        guarded()
+        assert not said
+        for _ in range(2):
+            thread = threading.Thread(target=guarded)
+            thread.start()
+            thread.join(60)
+    assert len(said) == 1 and "two threads differentiate at the same time" in said[0]
 
 
 def test_garbage_of_a_loop_is_collected_between_its_steps():

@@ -85,3 +85,32 @@ def test_integrators_that_override_sample_are_refused():
     base = next(c for c in type(mi.load_dict({"type": "direct_edge"})).__mro__ if hasattr(c, "TRACER"))
     with pytest.raises(TypeError, match="derivatives do not call `sample`"):
         type("Mine", (base,), {"sample": lambda self, *_, **__: None})
+
+
+# ---------------------- Depths that are set between two calls ----------------------
+
+
+@pytest.mark.parametrize("kind", ["prb_edge", "bdpt_edge", "bdpt", "rig"])
+def test_depths_are_attributes_as_well(kind):
+    it = mi.load_dict({"type": kind, "max_depth": 2})
+    it.max_depth, it.rr_depth = 4, 7
+    assert (it.max_depth, it.rr_depth) == (it.depths.max_depth, it.depths.rr_depth) == (4, 7)
+    for key, value in (("max_depth", -2), ("max_depth", 2.5), ("rr_depth", 0)):
+        with pytest.raises(ValueError, match=f'{kind}: "{key}" must be a whole number'):
+            setattr(it, key, value)
+
+
+@pytest.mark.parametrize(("kind", "longest"), [("bdpt_edge", 32), ("rig", 16)])
+def test_attributes_know_the_longest_path(kind, longest):
+    it = mi.load_dict({"type": kind})
+    for value in (-1, longest + 1):
+        with pytest.raises(ValueError, match=f'{kind}: "max_depth" must be at most {longest}, got {value}'):
+            it.max_depth = value
+    it.max_depth = longest
+
+
+def test_depths_cannot_be_set_on_direct_edge():
+    it = mi.load_dict({"type": "direct_edge"})
+    assert it.max_depth == 2
+    with pytest.raises(ValueError, match='direct_edge: "max_depth" cannot be set'):
+        it.max_depth = 5

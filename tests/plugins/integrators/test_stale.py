@@ -12,6 +12,7 @@ import mirrors
 import mitsuba as mi
 import numpy as np
 import pytest
+from other_textures import TEXTURES
 
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import find_welded_edges
@@ -223,6 +224,32 @@ def test_a_texture_that_comes_to_jump(kind):
     params.update()
     after = assert_as_fresh(scene, used, direct_edge, "board.to_world")
     assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
+
+
+@pytest.mark.parametrize("what", TEXTURES)
+def test_textures_jump_at_other_places(what):
+    make_scene, key, value = TEXTURES[what]
+    scene, used = make_scene(), direct_edge()
+    params = mi.traverse(scene)
+    moves = "board.vertex_positions" if "board.vertex_positions" in params else "cube.vertex_positions"
+    before = derivative(scene, used, moves)
+    params[key] = value(params[key])
+    params.update()
+    after = assert_as_fresh(scene, used, direct_edge, moves)
+    assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
+
+
+@pytest.mark.parametrize("kind", ["prb_edge", "bdpt_edge", "rig"])
+def test_depths_are_set_between_two_steps(kind):
+    """As scripts do, so that paths become longer in the course of an optimisation."""
+    lamp = {"type": "point", "position": [1, 4, -2], "intensity": 20.0}
+    scene, used = lit(shared_meshes(), lamp), mi.load_dict({"type": kind, "max_depth": 2})
+    before = derivative(scene, used, "cube.vertex_positions")
+    used.max_depth = 3
+    after = assert_as_fresh(scene, used, lambda: mi.load_dict({"type": kind, "max_depth": 3}), "cube.vertex_positions")
+    assert np.abs(after - before).sum() > 0.05 * np.abs(before).sum()
+    image = lambda it: np.array(mi.render(scene, integrator=it, spp=4), np.float64)
+    np.testing.assert_allclose(image(used), image(mi.load_dict({"type": kind, "max_depth": 3})), atol=1e-5)
 
 
 # ---------------------- Several scenes ----------------------
