@@ -275,6 +275,26 @@ def near_plane(sensor: Callable[..., dict] = camera) -> Callable[[], mi.Scene]:
     )
 
 
+def near_shape(kind: str, sensor: str = "perspective") -> Callable[[], mi.Scene]:
+    """The near clipping plane, two units before the camera, cuts through a sphere, a disk or a cylinder."""
+    shapes = {
+        "sphere": {"center": [0.3, 0, -3], "radius": 0.5},
+        "disk": {"center": [0.1, 0.13, -3]},
+        "cylinder": {"p0": [-2, 0, -2.8], "p1": [2, 0, -2.8], "radius": 0.5},
+        "tilted_cylinder": {"p0": [-0.3, -0.2, -3.6], "p1": [0.4, 0.3, -2.4], "radius": 0.4},
+    }
+
+    def build() -> mi.Scene:
+        props = {**shapes[kind], "bsdf": diffuse(0.8, 0.5, 0.3, two_sided=True)}
+        if kind == "disk":
+            to_world = mi.ScalarTransform4f().translate(props.pop("center")).rotate([1, 0, 0], 60)
+            props["to_world"] = to_world
+        at = camera((0, 0, -5), (0, 0, 0), sensor, near_clip=2.0)
+        return scene(sensor=at, thing={"type": kind.rpartition("_")[2], **props}, surroundings=surroundings())
+
+    return build
+
+
 def surroundings() -> dict:
     """What is far away, all around: a smooth picture."""
     picture = np.random.default_rng(3).uniform(0.1, 1.2, (6, 12, 3))

@@ -78,6 +78,12 @@ class SurfaceOfGrid:
         matrix = np.array(dr.detach(mi.traverse(self.inner)["to_world"].matrix), float).reshape(4, 4)[:3, :3]
         return self._renew().slack * (np.linalg.svd(matrix, compute_uv=False)[0] / (self.size - 1))
 
+    def lines(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The lines on faces of voxels: their vertices, (L, 2); the axis across the face; and how far from them, in the
+        face, the surface is: scene units. On the host."""
+        found = self._renew()
+        return found.lines, found.across, found.sag * self.voxel
+
     @property
     def window(self) -> np.ndarray:
         """How far from where smooth normals have it the outline may be, about each vertex: (V,), scene units, on the
@@ -264,6 +270,23 @@ def slack_of(geometry: Geometry) -> np.ndarray:
     0 but for grids."""
     slack = [m.slack if is_grid(m) else np.zeros(m.vertex_count()) for m in geometry.meshes]
     return np.concatenate([*slack, np.zeros(geometry.line_vertices)])
+
+
+def creases_of(geometry: Geometry, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of edges with these vertices, (E, 2): if they are lines on faces of voxels, how far from them, in the face, the
+    surface is, scene units, and the axis across the face; else −1 and 0. On the host."""
+    sag, across, start = np.full(len(ends), -1.0), np.zeros(len(ends), np.uint32), 0
+    wanted = np.sort(ends.astype(np.int64), axis=1)
+    for m in geometry.meshes:
+        count = m.vertex_count()
+        if is_grid(m):
+            lines, axis, off = m.lines()
+            key, of = (a[:, 0] * count + a[:, 1] for a in (lines, wanted - start))
+            at = np.minimum(np.searchsorted(key, of), len(key) - 1)
+            here = ((wanted >= start) & (wanted < start + count)).all(1) & (key[at] == of)
+            sag[here], across[here] = off[at[here]], axis[at[here]]
+        start += count
+    return sag, across
 
 
 class Grids:
