@@ -280,7 +280,7 @@ def near_shape(kind: str, sensor: str = "perspective") -> Callable[[], mi.Scene]
     shapes = {
         "sphere": {"center": [0.3, 0, -3], "radius": 0.5},
         "disk": {"center": [0.1, 0.13, -3]},
-        "cylinder": {"p0": [-2, 0, -2.8], "p1": [2, 0, -2.8], "radius": 0.5},
+        "cylinder": {"p0": [-2, -0.3, -2.8], "p1": [2, 0.5, -2.8], "radius": 0.5},
         "tilted_cylinder": {"p0": [-0.3, -0.2, -3.6], "p1": [0.4, 0.3, -2.4], "radius": 0.4},
     }
 
@@ -725,6 +725,8 @@ def crop(rfilter: str = "box") -> Callable[[], mi.Scene]:
 
 MIRRORED = prb_edge(3, sppc=256, sppp=32, sppi=32)
 
+SLIDE_THING, SLIDE_CAMERA = ({"key": f"{k}.to_world", "direction": [0.6, 1, 0.3]} for k in ("thing", "sensor"))
+
 CASES = [
     Case("two_triangles_green", two_triangles, vertex("green", 1), 4e-3, runs=48),
     Case("two_triangles_red", two_triangles, vertex("red", 1), 4e-3, runs=48),
@@ -767,6 +769,10 @@ CASES = [
     Case("near_plane_camera", near_plane(), ALONG, 2e-3),
     Case("near_plane_cut", cube(cut_open), SIDE, 4e-3),
     Case("near_plane_cut_camera", cube(cut_open), {"key": "sensor.to_world", "rotate": [0.3, 1, 0.3]}, 8e-4),
+    Case("near_plane_sphere", near_shape("sphere"), SLIDE_THING, 2e-3, reference_spp=4096),
+    Case("near_plane_disk", near_shape("disk", "orthographic"), SLIDE_THING, 2e-3, reference_spp=4096),
+    Case("near_plane_cylinder", near_shape("cylinder"), SLIDE_THING, 2e-3, reference_spp=4096),
+    Case("near_plane_camera_cylinder", near_shape("tilted_cylinder"), SLIDE_CAMERA, 2e-3, reference_spp=4096),
     Case("smooth_torus", smooth_torus(), UP, 6e-3, spp=64),
     Case("smooth_torus_camera", smooth_torus(), CAMERA_UP, 6e-3, spp=64),
     Case("room_cube", room(), SIDE, 6e-3),

@@ -31,7 +31,7 @@ from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import BESIDE, Horizon
 from .lune import Lune
 from .tracer import Tracer
-from .veils import is_veil
+from .veils import behind_veils, is_veil
 
 #: How often the distance is halved in which the outline of a grid is known to be.
 HALVINGS = 6
@@ -189,7 +189,7 @@ class FilmBoundary:
             offset = (aside + rest * reach) * n
             rays, weights = _beside(at, sensor, sampler, beside, offset, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
-            active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
+            active &= self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
             n_dl = dr.select(active, n_dl * found.forward, 0)
             shared = self._lune(at, chosen, lights, p, rays, met)
@@ -213,8 +213,7 @@ class FilmBoundary:
             lens = mi.Point2f(0.5) if at.aperture_sample is None else at.aperture_sample
             on_film = (u + part * offset - at.projection.crop_offset) / at.projection.crop_size
             ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, on_film, lens, active)
-            pi = tracer.first_hit(ray, active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+            si = self._on_surface(tracer.scene, ray, tracer.first_hit(ray, active), active)
             side = edges.side_of_crease(at.positions, at.normals, chosen.edge, found.t, p, si)
             surface = horizons.meets_grid(chosen.face, p, found.normal, ray, si)
             return dr.select(outline, dr.select(surface, mi.UInt32(1), 0), side)
@@ -234,6 +233,12 @@ class FilmBoundary:
         return u + dr.select(searched, 0.5 * (low + high), 0) * offset, 0.5 * (high - low), active
 
     # ---------------------- What is on their sides ----------------------
+
+    def _on_surface(self, scene: mi.Scene, ray, pi, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """What camera rays meet behind veils."""
+        if not self.veils:
+            return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        return behind_veils(scene, ray, pi, tuple(g.inner for g in self.outlines.grids), active)
 
     def _lune(self, at: Placed, chosen: Chosen, lights: mi.Vector4f | None, p, rays, met) -> Lune | None:
         """See `FilmOutlines.lune`; not of edges that are seen through a veil, from which light goes on to them."""
@@ -258,7 +263,7 @@ class FilmBoundary:
         crease = Crease.between(rays, met, active)
         return crease if lune is None else LuneOrCrease(lune, crease)
 
-    def _jumps_between(self, at: Placed, chosen: Chosen, found: Found, p, n, rays, met) -> mi.Bool:
+    def _jumps_between(self, scene: mi.Scene, at: Placed, chosen: Chosen, found: Found, p, n, rays, met) -> mi.Bool:
         """Is what jumps between two rays beside the points a jump of theirs, and not of another outline close by?
 
         p : the points. n : unit normals on the film, from the first ray to the second. met : what the rays meet.
@@ -275,14 +280,15 @@ class FilmBoundary:
             grids = outlines.edges.grids
             if grids.any:
                 of = at.positions, at.normals, chosen.edge, found.t, p
-                parted = grids.parts(chosen.edge, *(outlines.edges.side_of_crease(*of, si) for si in surfaces))
+                behind = [self._on_surface(scene, r, pi, chosen.is_edge) for r, pi in zip(rays, met, strict=True)]
+                parted = grids.parts(chosen.edge, *(outlines.edges.side_of_crease(*of, si) for si in behind))
                 hidden = dr.select(grids.are(chosen.edge), ~parted, hidden)
             jumps &= ~(chosen.is_edge & hidden)
         if outlines.horizons is not None:
             dark = outlines.horizons.sees_dark_side(chosen.face, p, rays[0], met[0], chosen.is_horizon)
             if outlines.horizons.any_grid:
                 # What was found about the outline of a grid may be that of another part of it, which hides it.
-                si = met[0].compute_surface_interaction(rays[0], mi.RayFlags.Minimal, chosen.is_horizon)
+                si = self._on_surface(scene, rays[0], met[0], chosen.is_horizon)
                 own = outlines.horizons.meets_grid(chosen.face, p, found.normal, rays[0], si, before=BESIDE)
                 dark = dr.select(outlines.horizons.is_of_grid(chosen.face), own, dark)
             jumps &= ~chosen.is_horizon | dark

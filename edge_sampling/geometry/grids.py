@@ -93,9 +93,7 @@ class SurfaceOfGrid:
     @property
     def voxel(self) -> float:
         """The longest side of a voxel: scene units."""
-        matrix = np.array(dr.detach(mi.traverse(self.inner)["to_world"].matrix), float).reshape(4, 4)[:3, :3]
-        self._renew()
-        return float(np.linalg.norm(matrix, axis=0).max() / (self.size - 1))
+        return voxel_of(self.inner)
 
     @property
     def on_faces(self) -> int:
@@ -308,6 +306,13 @@ class Grids:
         known = {id(s) for s in grids}
         others = tuple(s for s in geometry.others if id(s) not in known)
         return replace(geometry, meshes=(*geometry.meshes, *self._surfaces), others=others)
+
+
+def voxel_of(grid: mi.Shape) -> float:
+    """The longest side of a voxel of an `sdfgrid`: scene units."""
+    params = mi.traverse(grid)
+    matrix = np.array(dr.detach(params["to_world"].matrix), float).reshape(4, 4)[:3, :3]
+    return float(np.linalg.norm(matrix, axis=0).max() / (params["grid"].shape[0] - 1))
 
 
 def is_cubic(shape: Any) -> bool:
