@@ -30,7 +30,7 @@ from building import (
     scene,
 )
 from cuts import CURVES, CUTS
-from grids import GRIDS
+from grids import GRIDS, LONGER
 from hidden_lights import HIDDEN
 from instances import INSTANCES
 from joints import JOINTS
@@ -955,7 +955,7 @@ CASES = [
     ),
     *(Case(k, *of, spp=64, runs=12, integrator=kind, reference_spp=4096) for k, (*of, kind) in AS_WRITTEN.items()),
     *(
-        Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096 if k == "grid_slides" else 1024)
+        Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096 if k in LONGER else 1024)
         for k, (*of, depth) in GRIDS.items()
     ),
     *(

@@ -84,6 +84,16 @@ def in_the_sun(values: Callable[[], np.ndarray]) -> mi.Scene:
     return scene(sensor=camera((0.3, 0.9, -3.0), (0, 0.5, 0)), thing=grid("analytic", values=values()), sun=sun)
 
 
+def black() -> dict[str, Any]:
+    return grid(n=32, bsdf=diffuse(0.0, two_sided=True), values=torus(32))
+
+
+def behind_veil() -> mi.Scene:
+    bsdf = {"type": "mask", "opacity": 0.5, "nested": diffuse(0.0, two_sided=True)}
+    veil = quad((-2, -1, -1.6), (0, 4, 0), (4, 0, 0), "veil", bsdf=bsdf)
+    return scene(sensor=camera((0.63, 1.87, -3.4), (0.1, 0.2, 0)), thing=black(), veil=veil, **lamp("sky"))
+
+
 def bump(n: int = 64) -> list[float]:
     """A motion of the values that is not the same everywhere."""
     x = np.linspace(-1, 1, n)
@@ -94,6 +104,9 @@ def bump(n: int = 64) -> list[float]:
 SLIDES = {"key": "thing.to_world", "direction": [1, 0.5, 0]}
 GROWS = {"key": "thing.grid", "direction": [-1.0]}
 LAMP = {"key": "lamp.vertex_positions", "direction": [1, 0, 0.5]}
+
+#: Cases whose references take more samples.
+LONGER = "grid_slides", "grid_behind_veil"
 
 #: Of each case: scene, motion, step, max_depth.
 GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
@@ -106,5 +119,6 @@ GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_slides_in_hard_light": (partial(on_floor, lit="point"), SLIDES, 6e-3, 2),
     "grid_of_flat_normals": (partial(in_the_sun, ball), SLIDES, 2e-3, 2),
     "grid_that_ends": (partial(in_the_sun, slanted), SLIDES, 2e-3, 2),
+    "grid_behind_veil": (behind_veil, SLIDES, 6e-3, 2),
     "grid_deforms": (partial(on_floor, "analytic"), {"key": "thing.grid", "direction": bump()}, 4e-3, 2),
 }
