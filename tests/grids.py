@@ -88,6 +88,11 @@ def black() -> dict[str, Any]:
     return grid(n=32, bsdf=diffuse(0.0, two_sided=True), values=torus(32))
 
 
+def before_mirror() -> mi.Scene:
+    mirror = quad((-3, -1, 1.2), (0, 4, 0), (6, 0, 0), "mirror", bsdf={"type": "conductor"})
+    return scene(sensor=camera((1.63, 1.27, -2.2), (0, 0.5, 0.6)), thing=black(), mirror=mirror, **lamp("sky"))
+
+
 def behind_veil() -> mi.Scene:
     bsdf = {"type": "mask", "opacity": 0.5, "nested": diffuse(0.0, two_sided=True)}
     veil = quad((-2, -1, -1.6), (0, 4, 0), (4, 0, 0), "veil", bsdf=bsdf)
@@ -106,7 +111,7 @@ GROWS = {"key": "thing.grid", "direction": [-1.0]}
 LAMP = {"key": "lamp.vertex_positions", "direction": [1, 0, 0.5]}
 
 #: Cases whose references take more samples.
-LONGER = "grid_slides", "grid_behind_veil"
+LONGER = "grid_slides", "grid_in_mirror", "grid_behind_veil"
 
 #: Of each case: scene, motion, step, max_depth.
 GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
@@ -119,6 +124,7 @@ GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_slides_in_hard_light": (partial(on_floor, lit="point"), SLIDES, 6e-3, 2),
     "grid_of_flat_normals": (partial(in_the_sun, ball), SLIDES, 2e-3, 2),
     "grid_that_ends": (partial(in_the_sun, slanted), SLIDES, 2e-3, 2),
+    "grid_in_mirror": (before_mirror, SLIDES, 3e-3, 2),
     "grid_behind_veil": (behind_veil, SLIDES, 6e-3, 2),
     "grid_deforms": (partial(on_floor, "analytic"), {"key": "thing.grid", "direction": bump()}, 4e-3, 2),
 }
