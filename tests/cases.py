@@ -30,7 +30,7 @@ from building import (
     scene,
 )
 from cuts import CURVES, CUTS
-from grids import GRIDS
+from grids import GRIDS, LONGER
 from hidden_lights import HIDDEN
 from instances import INSTANCES
 from joints import JOINTS
@@ -273,6 +273,26 @@ def near_plane(sensor: Callable[..., dict] = camera) -> Callable[[], mi.Scene]:
         floor=mesh("floor", quad, [[0, 2, 1], [1, 2, 3]], bsdf=diffuse(0.5)),
         environment=constant(),
     )
+
+
+def near_shape(kind: str, sensor: str = "perspective") -> Callable[[], mi.Scene]:
+    """The near clipping plane, two units before the camera, cuts through a sphere, a disk or a cylinder."""
+    shapes = {
+        "sphere": {"center": [0.3, 0, -3], "radius": 0.5},
+        "disk": {"center": [0.1, 0.13, -3]},
+        "cylinder": {"p0": [-2, -0.3, -2.8], "p1": [2, 0.5, -2.8], "radius": 0.5},
+        "tilted_cylinder": {"p0": [-0.3, -0.2, -3.6], "p1": [0.4, 0.3, -2.4], "radius": 0.4},
+    }
+
+    def build() -> mi.Scene:
+        props = {**shapes[kind], "bsdf": diffuse(0.8, 0.5, 0.3, two_sided=True)}
+        if kind == "disk":
+            to_world = mi.ScalarTransform4f().translate(props.pop("center")).rotate([1, 0, 0], 60)
+            props["to_world"] = to_world
+        at = camera((0, 0, -5), (0, 0, 0), sensor, near_clip=2.0)
+        return scene(sensor=at, thing={"type": kind.rpartition("_")[2], **props}, surroundings=surroundings())
+
+    return build
 
 
 def surroundings() -> dict:
@@ -705,6 +725,8 @@ def crop(rfilter: str = "box") -> Callable[[], mi.Scene]:
 
 MIRRORED = prb_edge(3, sppc=256, sppp=32, sppi=32)
 
+SLIDE_THING, SLIDE_CAMERA = ({"key": f"{k}.to_world", "direction": [0.6, 1, 0.3]} for k in ("thing", "sensor"))
+
 CASES = [
     Case("two_triangles_green", two_triangles, vertex("green", 1), 4e-3, runs=48),
     Case("two_triangles_red", two_triangles, vertex("red", 1), 4e-3, runs=48),
@@ -747,6 +769,10 @@ CASES = [
     Case("near_plane_camera", near_plane(), ALONG, 2e-3),
     Case("near_plane_cut", cube(cut_open), SIDE, 4e-3),
     Case("near_plane_cut_camera", cube(cut_open), {"key": "sensor.to_world", "rotate": [0.3, 1, 0.3]}, 8e-4),
+    Case("near_plane_sphere", near_shape("sphere"), SLIDE_THING, 2e-3, reference_spp=4096),
+    Case("near_plane_disk", near_shape("disk", "orthographic"), SLIDE_THING, 2e-3, reference_spp=4096),
+    Case("near_plane_cylinder", near_shape("cylinder"), SLIDE_THING, 2e-3, reference_spp=4096),
+    Case("near_plane_camera_cylinder", near_shape("tilted_cylinder"), SLIDE_CAMERA, 2e-3, reference_spp=4096),
     Case("smooth_torus", smooth_torus(), UP, 6e-3, spp=64),
     Case("smooth_torus_camera", smooth_torus(), CAMERA_UP, 6e-3, spp=64),
     Case("room_cube", room(), SIDE, 6e-3),
@@ -929,7 +955,7 @@ CASES = [
     ),
     *(Case(k, *of, spp=64, runs=12, integrator=kind, reference_spp=4096) for k, (*of, kind) in AS_WRITTEN.items()),
     *(
-        Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096 if k == "grid_slides" else 1024)
+        Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096 if k in LONGER else 1024)
         for k, (*of, depth) in GRIDS.items()
     ),
     *(

@@ -65,6 +65,40 @@ def along_axis() -> mi.Scene:
     return scene(sensor=sensor, thing=grid(bsdf=diffuse(0.0, two_sided=True), values=torus(64)), **lamp("sky"))
 
 
+def ball() -> np.ndarray:
+    x = np.linspace(-1, 1, 32)
+    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+    return np.sqrt((x - 0.03) ** 2 + (y + 0.05) ** 2 + (z - 0.02) ** 2) - 0.7
+
+
+def slanted() -> np.ndarray:
+    """Two planes, up to a small twist, which leave the box of their grid."""
+    x = np.linspace(-1, 1, 9)
+    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+    return z + 0.6 * np.abs(x) + 0.2 * y + 0.25 * x * y + 0.05
+
+
+def in_the_sun(values: Callable[[], np.ndarray]) -> mi.Scene:
+    """With `analytic` normals, which jump where voxels meet. The sun is behind the camera: no shadow is seen."""
+    sun = {"type": "directional", "direction": [-0.1, -0.25, 1], "irradiance": {"type": "rgb", "value": 3}}
+    return scene(sensor=camera((0.3, 0.9, -3.0), (0, 0.5, 0)), thing=grid("analytic", values=values()), sun=sun)
+
+
+def black() -> dict[str, Any]:
+    return grid(n=32, bsdf=diffuse(0.0, two_sided=True), values=torus(32))
+
+
+def before_mirror() -> mi.Scene:
+    mirror = quad((-3, -1, 1.2), (0, 4, 0), (6, 0, 0), "mirror", bsdf={"type": "conductor"})
+    return scene(sensor=camera((1.63, 1.27, -2.2), (0, 0.5, 0.6)), thing=black(), mirror=mirror, **lamp("sky"))
+
+
+def behind_veil() -> mi.Scene:
+    bsdf = {"type": "mask", "opacity": 0.5, "nested": diffuse(0.0, two_sided=True)}
+    veil = quad((-2, -1, -1.6), (0, 4, 0), (4, 0, 0), "veil", bsdf=bsdf)
+    return scene(sensor=camera((0.63, 1.87, -3.4), (0.1, 0.2, 0)), thing=black(), veil=veil, **lamp("sky"))
+
+
 def bump(n: int = 64) -> list[float]:
     """A motion of the values that is not the same everywhere."""
     x = np.linspace(-1, 1, n)
@@ -76,6 +110,9 @@ SLIDES = {"key": "thing.to_world", "direction": [1, 0.5, 0]}
 GROWS = {"key": "thing.grid", "direction": [-1.0]}
 LAMP = {"key": "lamp.vertex_positions", "direction": [1, 0, 0.5]}
 
+#: Cases whose references take more samples.
+LONGER = "grid_slides", "grid_in_mirror", "grid_behind_veil"
+
 #: Of each case: scene, motion, step, max_depth.
 GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_slides": (on_floor, SLIDES, 6e-3, 2),
@@ -85,5 +122,9 @@ GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_grows": (on_floor, GROWS, 4e-3, 2),
     "grid_lamp": (on_floor, LAMP, 1e-2, 2),
     "grid_slides_in_hard_light": (partial(on_floor, lit="point"), SLIDES, 6e-3, 2),
+    "grid_of_flat_normals": (partial(in_the_sun, ball), SLIDES, 2e-3, 2),
+    "grid_that_ends": (partial(in_the_sun, slanted), SLIDES, 2e-3, 2),
+    "grid_in_mirror": (before_mirror, SLIDES, 3e-3, 2),
+    "grid_behind_veil": (behind_veil, SLIDES, 6e-3, 2),
     "grid_deforms": (partial(on_floor, "analytic"), {"key": "thing.grid", "direction": bump()}, 4e-3, 2),
 }

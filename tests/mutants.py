@@ -175,7 +175,7 @@ MUTANTS = [
         "a, b, crossed = cut_by_plane(corners, depth)",
         "a, b, crossed = dr.detach(cut_by_plane(corners, depth))",
     ),
-    mutant("film boundary: looks 100 times as far aside", FILM, "in_world = ulps", "in_world = 100 * ulps"),
+    mutant("film boundary: looks 100 times as far aside", FILM, "(ulps * largest", "(100 * ulps * largest"),
     mutant(
         "edges from points: not shared with the lights' samples",
         SHADING,
@@ -198,7 +198,7 @@ MUTANTS = [
     mutant(
         "film boundary: looks as near beside glass as beside other meshes",
         FILM,
-        "in_world += dr.select(chosen.is_edge, farther, 0)",
+        "farther = dr.select(chosen.is_edge, beside_edge, 0)",
         "pass",
     ),
     mutant(

@@ -7,8 +7,9 @@ For a pixel with filter k, I = ∫ k(u) L(u) du. Where an edge moves with the ve
 (Li et al. 2018, Eq. 7, with the edge function's gradient written as a velocity). With the edge as a curve u(t), the
 length element and the normal join to n dl = (−u'ᵧ, u'ₓ) dt, so that neither is ever normalised.
 
-Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces,
-where interpolated normals turn away from the viewer (`horizon.py`), and at the outlines of spheres, disks, cylinders.
+Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces and
+through spheres, disks and cylinders, where interpolated normals turn away from the viewer (`horizon.py`), and at the
+outlines of spheres, disks and cylinders.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .horizon import BESIDE, Horizon
 from .lune import Lune
 from .tracer import Tracer
-from .veils import is_veil
+from .veils import behind_veils, is_veil
 
 #: How often the distance is halved in which the outline of a grid is known to be.
 HALVINGS = 6
@@ -182,11 +183,13 @@ class FilmBoundary:
                 n_dl = dr.select(chosen.is_horizon, dr.mulsign(n_dl, dr.dot(n_dl, found.facing)), n_dl)
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
-            offset = self._offset(scene, at, p, chosen) * dr.normalize(n_dl)
-            beside, offset, active = self._on_grid(tracer, at, sensor, chosen, found, u, p, offset, active)
+            aside, reach = self._offset(scene, at, p, chosen)
+            n = dr.normalize(n_dl)
+            beside, rest, active = self._on_grid(tracer, at, sensor, chosen, found, u, p, (aside + reach) * n, active)
+            offset = (aside + rest * reach) * n
             rays, weights = _beside(at, sensor, sampler, beside, offset, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
-            active &= self._jumps_between(at, chosen, found, p, dr.normalize(n_dl), rays, met)
+            active &= self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays)
             n_dl = dr.select(active, n_dl * found.forward, 0)
             shared = self._lune(at, chosen, lights, p, rays, met)
@@ -196,29 +199,28 @@ class FilmBoundary:
             return BoundaryPoints(beside, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
 
     def _on_grid(self, tracer: Tracer, at: Placed, sensor, chosen: Chosen, found: Found, u, p, offset, active) -> tuple:
-        """Where to look at the outline of a grid, or at a crease between its voxels, which are only somewhere between
-        u − offset and u + offset: there, and the offset from there, both by bisection; and is it there?"""
+        """Where the outline of a grid is, or a crease between its voxels, which are only known to be somewhere between
+        u − offset and u + offset: by bisection; the part of that distance that is left; and is it there?"""
         edges, horizons = self.outlines.edges, self.outlines.horizons
-        if edges is None or not edges.any_grid:
-            return u, offset, active
+        if edges is None or not edges.grids.any:
+            return u, 1, active
         outline = chosen.is_horizon & horizons.is_of_grid(chosen.face)
-        of_grid = outline | (chosen.is_edge & edges.is_of_grid(chosen.edge))
+        of_grid = outline | (chosen.is_edge & edges.grids.are(chosen.edge))
         searched = active & of_grid
 
         def side(part, active):
-            """What is met there: nothing (0), the grid (1), or which of its voxels."""
+            """What is met there: nothing (0), the grid (1), or which side of a crease (1, 2)."""
             lens = mi.Point2f(0.5) if at.aperture_sample is None else at.aperture_sample
             on_film = (u + part * offset - at.projection.crop_offset) / at.projection.crop_size
             ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, on_film, lens, active)
-            pi = tracer.first_hit(ray, active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-            voxel = dr.select(edges.meets_grid(at.positions, chosen.edge, p, si), pi.prim_index + 1, 0)
+            si = self._on_surface(tracer.scene, ray, tracer.first_hit(ray, active), active)
+            side = edges.side_of_crease(at.positions, at.normals, chosen.edge, found.t, p, si)
             surface = horizons.meets_grid(chosen.face, p, found.normal, ray, si)
-            return dr.select(outline, dr.select(surface, mi.UInt32(1), 0), voxel)
+            return dr.select(outline, dr.select(surface, mi.UInt32(1), 0), side)
 
         one = dr.full(mi.Float, 1, dr.width(u))
         first, last = side(-one, searched), side(one, searched)
-        there = dr.select(outline, (first == 1) & (last == 0), first != last)
+        there = dr.select(outline, (first == 1) & (last == 0), edges.grids.parts(chosen.edge, first, last))
         active, searched = active & (there | ~of_grid), searched & there
 
         def halve(k, low, high):
@@ -228,10 +230,15 @@ class FilmBoundary:
 
         state = (dr.zeros(mi.UInt32, dr.width(u)), -one, one)
         _, low, high = dr.while_loop(state, lambda k, *_: searched & (k < HALVINGS), halve, label="outlines of grids")
-        middle, rest = 0.5 * (low + high), dr.select(searched, 0.5 * (high - low), 1)
-        return u + dr.select(searched, middle, 0) * offset, rest * offset, active
+        return u + dr.select(searched, 0.5 * (low + high), 0) * offset, 0.5 * (high - low), active
 
     # ---------------------- What is on their sides ----------------------
+
+    def _on_surface(self, scene: mi.Scene, ray, pi, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """What camera rays meet behind veils."""
+        if not self.veils:
+            return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        return behind_veils(scene, ray, pi, tuple(g.inner for g in self.outlines.grids), active)
 
     def _lune(self, at: Placed, chosen: Chosen, lights: mi.Vector4f | None, p, rays, met) -> Lune | None:
         """See `FilmOutlines.lune`; not of edges that are seen through a veil, from which light goes on to them."""
@@ -256,7 +263,7 @@ class FilmBoundary:
         crease = Crease.between(rays, met, active)
         return crease if lune is None else LuneOrCrease(lune, crease)
 
-    def _jumps_between(self, at: Placed, chosen: Chosen, found: Found, p, n, rays, met) -> mi.Bool:
+    def _jumps_between(self, scene: mi.Scene, at: Placed, chosen: Chosen, found: Found, p, n, rays, met) -> mi.Bool:
         """Is what jumps between two rays beside the points a jump of theirs, and not of another outline close by?
 
         p : the points. n : unit normals on the film, from the first ray to the second. met : what the rays meet.
@@ -270,12 +277,18 @@ class FilmBoundary:
                 for ray, pi in zip(rays, met, strict=True)
             ]
             hidden = outlines.edges.is_hidden(at.positions, chosen.edge, p, eye, view, rays, surfaces)
+            grids = outlines.edges.grids
+            if grids.any:
+                of = at.positions, at.normals, chosen.edge, found.t, p
+                behind = [self._on_surface(scene, r, pi, chosen.is_edge) for r, pi in zip(rays, met, strict=True)]
+                parted = grids.parts(chosen.edge, *(outlines.edges.side_of_crease(*of, si) for si in behind))
+                hidden = dr.select(grids.are(chosen.edge), ~parted, hidden)
             jumps &= ~(chosen.is_edge & hidden)
         if outlines.horizons is not None:
             dark = outlines.horizons.sees_dark_side(chosen.face, p, rays[0], met[0], chosen.is_horizon)
             if outlines.horizons.any_grid:
                 # What was found about the outline of a grid may be that of another part of it, which hides it.
-                si = met[0].compute_surface_interaction(rays[0], mi.RayFlags.Minimal, chosen.is_horizon)
+                si = self._on_surface(scene, rays[0], met[0], chosen.is_horizon)
                 own = outlines.horizons.meets_grid(chosen.face, p, found.normal, rays[0], si, before=BESIDE)
                 dark = dr.select(outlines.horizons.is_of_grid(chosen.face), own, dark)
             jumps &= ~chosen.is_horizon | dark
@@ -315,25 +328,30 @@ class FilmBoundary:
             reach = dr.select(of_grid, 2 * horizons.window(chosen.face)[0], 0)
         return [Horizon(s, p, on_curve, reach) for s in sides]
 
-    def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> mi.Float:
-        """How far beside the edge to look, in pixels: just beyond what single precision can tell apart.
+    def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> tuple[mi.Float, mi.Float]:
+        """How far beside the edge to look, in pixels: just beyond what single precision can tell apart; and how much
+        farther an outline or a crease of a grid may be.
 
-        Farther beside spheres, disks and cylinders, which rays meet less precisely.
+        Farther beside grids, spheres, disks and cylinders, which rays meet less precisely.
         """
-        projection, ulp = at.projection, dr.epsilon(mi.Float) * 2
-        ulps = dr.select(chosen.is_curve, 8, 2) * ulp if self.outlines.curves is not None else 2 * ulp
-        largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
-        in_world = ulps * largest
-        if self.outlines.edges is not None:
-            viewer = projection.viewer(at.aperture_sample)
+        projection, outlines, ulp = at.projection, self.outlines, dr.epsilon(mi.Float) * 2
+        imprecise, farther, reach = chosen.is_curve | chosen.is_cut, mi.Float(0), mi.Float(0)
+        if outlines.edges is not None:
+            viewer, grids = projection.viewer(at.aperture_sample), outlines.edges.grids
             to_viewer = mi.Vector3f(viewer) if projection.orthographic else viewer - p
-            farther = self.outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)
-            in_world += dr.select(chosen.is_edge, farther, 0)
-        if self.outlines.horizons is not None:
-            in_world += dr.select(chosen.is_horizon, self.outlines.horizons.window(chosen.face)[0], 0)
-        in_world *= projection.pixels_per_unit(projection.film(p))
+            beside_edge = outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)
+            farther = dr.select(chosen.is_edge, beside_edge, 0)
+            if grids.any:
+                reach = dr.select(chosen.is_edge, grids.reach(chosen.edge), 0)
+                imprecise |= chosen.is_edge & grids.are(chosen.edge)
+        if outlines.horizons is not None and outlines.horizons.any_grid:
+            reach = dr.select(chosen.is_horizon, outlines.horizons.window(chosen.face)[0], reach)
+            imprecise |= chosen.is_horizon & outlines.horizons.is_of_grid(chosen.face)
+        ulps = dr.select(imprecise, 8, 2) * ulp
+        largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
+        per_unit = projection.pixels_per_unit(projection.film(p))
         on_film = ulps * max(projection.crop_size + projection.crop_offset)
-        return in_world + on_film
+        return (ulps * largest + farther) * per_unit + on_film, reach * per_unit
 
 
 def _beside(at: Placed, sensor: mi.Sensor, sampler: mi.Sampler, u, offset, active) -> tuple[list, list]:

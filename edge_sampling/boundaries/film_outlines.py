@@ -14,11 +14,12 @@ from rimlight.edge_sampling.geometry.edges import EdgeKind, Edges
 from rimlight.edge_sampling.geometry.grids import grids_of, is_grid, normals
 from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
-from rimlight.edge_sampling.projection.sensors import Projection
+from rimlight.edge_sampling.projection.sensors import FilmPoint, Projection
 
 from .crease import is_matt
 from .horizon import HorizonPoint, Horizons
 from .lune import Lune, spreads
+from .near_cuts import NearCuts
 
 #: Lengths on the film are added up as whole numbers of this many pixels: integer sums do not depend on their order, so
 #: an edge that cannot be seen changes nothing, not even the last bit.
@@ -44,12 +45,13 @@ class Placed:
 
 @dataclass
 class Chosen:
-    """An edge, a cut, a horizon or a piece of a curve for each sample.
+    """An edge, a cut through a face, a horizon, a piece of a curve or of a cut through an analytic shape, for each
+    sample.
 
     index : mi.UInt32, (N,), among all of these.
     along : mi.Float, position along its visible part, uniform in [0, 1) on the film.
     density : mi.Float, expected number of samples on it; 0 where none is visible.
-    edge, face, piece : its number among those of its kind; 0 where it is of another.
+    edge, face, piece, cut : its number among those of its kind; 0 where it is of another.
     """
 
     index: mi.UInt32
@@ -59,9 +61,11 @@ class Chosen:
     is_line: mi.Bool
     is_horizon: mi.Bool
     is_curve: mi.Bool
+    is_cut: mi.Bool
     edge: mi.UInt32
     face: mi.UInt32
     piece: mi.UInt32
+    cut: mi.UInt32
 
 
 @dataclass
@@ -86,14 +90,14 @@ class Found:
 
 class FilmOutlines:
     """The edges of meshes, the cuts of the near clipping plane through their faces, the horizons of interpolated
-    normals, and the curves of analytic shapes.
+    normals, the curves of analytic shapes, and the cuts through these.
 
     Parameters
     ----------
     geometry, edges, moving, turning, soft, seams : see `FilmBoundary`.
     """
 
-    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "lines", "grids")
+    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "near_cuts", "lines", "grids")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
 
     def __init__(
@@ -123,11 +127,13 @@ class FilmOutlines:
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
         self.curves = Curves.of(geometry, moving[len(geometry.meshes) :], seams=seams)
+        self.near_cuts = NearCuts(self.curves) if self.curves is not None else None
         horizons = Horizons(geometry, moving[: len(geometry.meshes)] | turning)
         self.horizons = horizons if len(horizons) else None
-        #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are.
-        cuts = len(faces) if len(edges) else 0
-        self.counts = (len(edges), cuts, len(horizons), len(self.curves) if self.curves is not None else 0)
+        #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are, and then
+        #: of cuts through analytic shapes.
+        cuts, of_curves = len(faces) if len(edges) else 0, (self.curves, self.near_cuts)
+        self.counts = (len(edges), cuts, len(horizons), *(len(c) if c is not None else 0 for c in of_curves))
 
     @property
     def any_smooth(self) -> bool:
@@ -155,14 +161,16 @@ class FilmOutlines:
         start = mi.Float64(dr.gather(mi.UInt64, cumulative, index)) - size
         along = dr.select(size > 0, dr.clip(mi.Float((x - start) / size), 0, dr.one_minus_epsilon(mi.Float)), 0)
         density = dr.select(total > 0, mi.Float(count * size / total), 0)
-        # Edges come first, then cuts, horizons, pieces of curves.
-        is_edge, is_line = index < self.counts[0], index < sum(self.counts[:2])
-        is_curve = index >= sum(self.counts[:3])
-        is_horizon = ~is_line & ~is_curve
+        # In this order: edges, cuts through faces, horizons, pieces of curves and of cuts.
+        first = np.cumsum(self.counts).tolist()
+        is_edge, is_line = index < first[0], index < first[1]
+        is_horizon, is_curve = ~is_line & (index < first[2]), (index >= first[2]) & (index < first[3])
+        is_cut = index >= first[3]
         edge = dr.select(is_edge, index, 0)
-        face = dr.select(is_horizon, index - sum(self.counts[:2]), 0)
-        piece = dr.select(is_curve, index - sum(self.counts[:3]), 0)
-        return Chosen(index, along, density, is_edge, is_line, is_horizon, is_curve, edge, face, piece)
+        face, piece, cut = (
+            dr.select(there, index - n, 0) for there, n in zip((is_horizon, is_curve, is_cut), first[1:], strict=False)
+        )
+        return Chosen(index, along, density, is_edge, is_line, is_horizon, is_curve, is_cut, edge, face, piece, cut)
 
     def find(self, at: Placed, chosen: Chosen) -> Found:
         """What is known of the points before they are attached."""
@@ -184,6 +192,10 @@ class FilmOutlines:
             on_film = projection.tangent(c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), lens)
             found.along_film = dr.select(chosen.is_curve, on_film, found.along_film)
             found.valid |= chosen.is_curve & c.valid & (projection.film(c.p).z > projection.near)
+            p, along, there = self.near_cuts.point(at.frames, chosen.cut, chosen.along, projection)
+            on_film = projection.tangent(p, mi.Point3f(p + along), mi.Float(0), lens)
+            found.along_film = dr.select(chosen.is_cut, on_film, found.along_film)
+            found.valid |= chosen.is_cut & there
         if self.horizons is not None:
             h = self._horizon_point(at, chosen)
             across = lambda v: projection.tangent(h.p, mi.Point3f(h.p + v), mi.Float(0), lens)
@@ -207,6 +219,8 @@ class FilmOutlines:
                 p = dr.select(chosen.is_edge & curved, on_curve, p)
         if self.curves is not None:
             p = dr.select(chosen.is_curve, self._curve_point(at, chosen, found).p, p)
+            on_cut = self.near_cuts.point(at.frames, chosen.cut, chosen.along, at.projection)[0]
+            p = dr.select(chosen.is_cut, on_cut, p)
         if self.horizons is not None:
             p = dr.select(chosen.is_horizon, self._horizon_point(at, chosen).p, p)
         return p
@@ -245,9 +259,10 @@ class FilmOutlines:
         )
         if lights is not None:
             jumps |= self.edges.is_silhouette_of_any(at.positions, edge, lights)
-        if self.edges.any_grid:
+        if self.edges.grids.any:
             # The outlines of grids are among the horizons.
-            jumps &= ~self.edges.is_of_grid(edge) | self.edges.is_flat(edge)
+            grids = self.edges.grids
+            jumps &= ~grids.are(edge) | grids.are_open(edge) | self.edges.is_flat(edge)
         return jumps
 
     def visible_lengths(self, at: Placed, lights: mi.Vector4f | None, by_angle: bool) -> mi.Float:
@@ -274,7 +289,7 @@ class FilmOutlines:
             length = projection.clip(a, b).length
             lengths.append(dr.select(possible, length, 0))
         if self.curves is not None:
-            lengths.append(self._curve_length(at))
+            lengths += [self._curve_length(at), self._length_of_cuts(at)]
         return dr.concat(lengths) if len(lengths) > 1 else lengths[0]
 
     def _part_of_crease(self, at: Placed, edge: mi.UInt32) -> mi.Float:
@@ -288,11 +303,27 @@ class FilmOutlines:
         projection, frames = at.projection, at.frames
         piece = dr.arange(mi.UInt32, self.counts[3])
         eye = -projection.view() if projection.orthographic else projection.eye()
-        lower, upper = projection.frame
         points = [
             projection.film(self.curves.point(frames, piece, mi.Float(t), eye, projection.orthographic).p)
             for t in (0, 0.5, 1)
         ]
+        in_front = [q.z > projection.near for q in points]
+        return self._length_through(projection, points, in_front)
+
+    def _length_of_cuts(self, at: Placed) -> mi.Float:
+        """The same of the cuts of the near clipping plane through analytic shapes."""
+        piece, points, there = dr.arange(mi.UInt32, self.counts[4]), [], []
+        for t in (0, 0.5, 1):
+            p, _, valid = self.near_cuts.point(at.frames, piece, mi.Float(t), at.projection)
+            points.append(at.projection.film(p))
+            there.append(valid)
+        return self._length_through(at.projection, points, there)
+
+    @staticmethod
+    def _length_through(projection: Projection, points: list[FilmPoint], in_front: list[mi.Bool]) -> mi.Float:
+        """About the length of pieces of curves inside of the frame, by three points of each. in_front : which of these
+        are there, and not behind the viewer."""
+        lower, upper = projection.frame
         start, middle, end = (q.position() for q in points)
         length = dr.norm(middle - start) + dr.norm(end - middle)
         size = dr.norm(mi.Vector2f(upper - lower))
@@ -301,7 +332,6 @@ class FilmOutlines:
         outside = mi.Bool(False)
         for i in (0, 1):
             outside |= (middle[i] + length + blur < lower[i]) | (middle[i] - length - blur > upper[i])
-        in_front = [q.z > projection.near for q in points]
         whole = in_front[0] & in_front[1] & in_front[2] & dr.isfinite(length)
         length = dr.select(outside, 0, dr.minimum(length, size) + LENGTH_UNIT)
         length = dr.select(whole, length, dr.select(in_front[0] | in_front[1] | in_front[2], size, 0))

@@ -24,6 +24,10 @@ from rimlight.edge_sampling.parametrisation import material_point
 #: Barycentric coordinate from which on a point is taken to lie inside of a triangle.
 INSIDE = 1e-3
 
+#: How far two points of the surface of a grid may be apart that lie on both sides of a bend, in units of the distance
+#: of the rays that meet them.
+BENT = 64
+
 
 @dataclass
 class Touch:
@@ -111,8 +115,8 @@ def _of_cut(ray, near, far, active) -> Touch:
 
 
 def _of_curved(scene, ray, near, far, reach, active) -> Touch:
-    """At the contour or a rim of a shape that is no mesh, or where another surface cuts it: that is then met in its
-    tangent plane."""
+    """At the contour or a rim of a shape that is no mesh, at a bend of it, or where another surface cuts it: that is
+    then met in its tangent plane."""
     near_ray, pi = near
     with dr.resume_grad():
         si = material_point(near_ray, pi, active, mi.RayFlags.All)
@@ -130,6 +134,10 @@ def _of_curved(scene, ray, near, far, reach, active) -> Touch:
             from_rim = dr.minimum(at.uv.y, 1 - at.uv.y) * dr.norm(at.dp_dv)
             rim = (pi.shape == mi.ShapePtr(shape)) & (from_rim < 2 * reach)
             tangent = dr.select(rim, at.dp_du, tangent)
+        elif kind == "SDFGrid":
+            # Where its voxels meet, its surface is bent, as where two surfaces cut each other.
+            bent = dr.norm(other.p - at.p) <= BENT * reach + rounding(at.p, ray.o)
+            cut |= active & other.is_valid() & bent & (other.shape == at.shape) & (pi.shape == mi.ShapePtr(shape))
     across = _unit(dr.cross(tangent, ray.d))
     with dr.resume_grad():
         return Touch(across, dr.dot(at.p - ray.o, ray.d), dr.dot(across, si.p), cut)

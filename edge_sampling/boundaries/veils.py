@@ -19,6 +19,25 @@ def is_veil(si: mi.SurfaceInteraction3f) -> mi.Bool:
     return si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
 
 
+def behind_veils(
+    scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, besides: tuple[mi.Shape, ...], active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """What rays meet behind all veils but some. pi : what they meet first. Detached."""
+
+    def go_on(ray, pi, active):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        through = active & is_veil(si)
+        for shape in besides:
+            through &= si.shape != mi.ShapePtr(shape)
+        ray = dr.select(through, mi.Ray3f(spawn_ray(scene, si, ray.d, True)), ray)
+        beyond = scene.ray_intersect_preliminary(ray, active=through)
+        return ray, dr.select(through, beyond, pi), through & beyond.is_valid()
+
+    state = (mi.Ray3f(ray), mi.PreliminaryIntersection3f(pi), active & pi.is_valid())
+    ray, pi, _ = dr.while_loop(state, lambda *state: state[-1], go_on, label="behind veils")
+    return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+
+
 @dataclass
 class Veiled:
     """What veils let through of the light along rays that end.

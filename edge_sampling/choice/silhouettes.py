@@ -249,7 +249,8 @@ class Silhouettes:
             return aside
         active = sample.edge < self.count
         edge = dr.select(active, sample.edge, 0)
-        farther = self.tree.device_edges.farther(scene, placement.positions, edge, p, x - p)
+        edges = self.tree.device_edges
+        farther = edges.farther(scene, placement.positions, edge, p, x - p) + edges.grids.slack(edge)
         return aside + dr.select(active, farther, 0)
 
     def point(
@@ -265,7 +266,7 @@ class Silhouettes:
             with dr.suspend_grad():
                 inwards = tuple(dr.detach(o - p) for o in edges.opposite(placement.positions, index))
                 is_line = index >= self._first_line if self.lines else mi.Bool(False)
-                of_grid = edges.slack(index), edges.is_concave(placement.positions, index)
+                of_grid = edges.grids.slack(index), edges.is_concave(placement.positions, index)
                 point = OutlinePoint(p, dr.detach(b - a), inwards, is_line, mi.Bool(False), *of_grid)
             if edges.curves is not None:
                 curved, on_curve, tangent = edges.on_curve(placement.positions, index, sample.t)

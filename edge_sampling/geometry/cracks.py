@@ -8,7 +8,6 @@ is no hole. End points that are a little apart count as one: cracks that are nar
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -16,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from . import meshes
-from .edges import EdgeKind, Edges, Weld
+from .edges import SLIVER, EdgeKind, Edges, Weld
 from .meshes import Geometry
 
 #: An end point closer to the end of an edge than this, relative to its length, is not inside of it.
@@ -28,9 +27,6 @@ ON_EDGE = 1e-5
 
 #: Edges are parallel within this sine.
 PARALLEL = 1e-4
-
-#: Height of a triangle, relative to its longest side, up to which it has no area.
-SLIVER = 1e-6
 
 #: At most so many pairs of an edge and an end point near it are looked at: a soup of long triangles has too many.
 PAIRS = 10**7
@@ -99,8 +95,26 @@ class _Open:
 def close_cracks(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
     """Join the open edges that lie on one another. On the host, and cheap: only open edges take part.
 
-    Returns the edges, the joined ones last, and where they were joined.
+    Returns the edges, the joined ones last; and where they were joined, and where faces without area were left out.
     """
+    edges, cracks = _join(geometry, edges, weld)
+    return edges, cracks + _left_out(geometry, weld.slivers)
+
+
+def _left_out(geometry: Geometry, slivers: np.ndarray) -> Cracks:
+    """The corners of faces without area lie on edges, as long as there is none. slivers : see `Weld`."""
+    if not len(slivers):
+        return Cracks.none()
+    p = geometry.host_positions()[slivers].astype(np.float64)
+    along = p[:, 2] - p[:, 1]
+    squared = np.square(along).sum(1)
+    at = np.einsum("ij,ij->i", p[:, 0] - p[:, 1], along) / squared
+    counts = np.cumsum([m.vertex_count() for m in geometry.meshes])
+    mesh = np.repeat(np.searchsorted(counts, slivers[:, :1], side="right"), 2, axis=1)
+    return Cracks(slivers[:, 0], slivers[:, 1:], at, mesh, np.zeros(len(at)), SLIVER * np.sqrt(squared))
+
+
+def _join(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
     where = np.flatnonzero(edges.open)
     if len(where) < 2:
         return edges, Cracks.none()
@@ -231,18 +245,3 @@ def _is_even(mesh: object) -> bool:
     """Is the plane of its faces all that differs between the faces of a mesh?"""
     varies = meshes.has_interpolated_normals(mesh) or meshes.jumps_at_every_edge(mesh)
     return not varies and meshes.vertex_values(mesh).shape[1] == 0
-
-
-def has_open_sliver(mesh: Any) -> bool:
-    """Does a face that has no area, but different corners, lie along the open border of a mesh?"""
-    p, corners = meshes.vertices(mesh).astype(np.float64), meshes.faces(mesh)
-    sides = p[np.roll(corners, -1, 1)] - p[corners]
-    squared = np.square(sides).sum(2)
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    thin = (area <= SLIVER * squared.max(1)) & (squared.min(1) > 0)
-    if not thin.any():
-        return False
-    place = np.unique(p, axis=0, return_inverse=True)[1].ravel()
-    ends = np.sort(place[np.stack([corners, np.roll(corners, -1, 1)], 2)], 2).reshape(-1, 2)
-    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    return bool((count[edge.ravel()].reshape(-1, 3)[thin] == 1).any())

@@ -89,10 +89,10 @@ class Curves:
     """
 
     _OTHER = ("any_joined", "_joined", "_other_kind", "_other_shape")
-    DRJIT_STRUCT = dict.fromkeys(("count", "_shapes", "_seams", "_kind", "_shape", *_OTHER))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("count", "shapes", "_seams", "_kind", "_shape", *_OTHER))  # for `dr.freeze`
 
     def __init__(self, shapes: tuple[mi.Shape, ...], joints: tuple = (), *, seams: bool = False):
-        self._shapes, self._seams = shapes, seams
+        self.shapes, self._seams = shapes, seams
         curves = [(kind, i) for i, s in enumerate(shapes) for kind in CURVES[s.class_name()]]
         curves += [(SEAMS[s.class_name()], i) for i, s in enumerate(shapes)] if seams else []
         second = {joint[0]: joint[1] for joint in joints}
@@ -128,7 +128,7 @@ class Curves:
     def frames(self) -> mi.Float:
         """`to_world` of all shapes, attached, and its inverse, detached: 24 numbers each, row by row."""
         rows = []
-        for shape in self._shapes:
+        for shape in self.shapes:
             to_world = mi.traverse(shape)["to_world"]
             for m in (to_world.matrix, dr.detach(to_world).inverse().matrix):
                 rows += [mi.Float(m[i, j]) for i in range(3) for j in range(4)]
@@ -224,7 +224,13 @@ class Curves:
         self, frames: mi.Float, curve: mi.UInt32, start: int, shapes: mi.UInt32 | None = None
     ) -> list[mi.Vector3f]:
         """Images of the axes, and of the origin. shapes : of all curves, unless it is the first one of each."""
-        first = dr.gather(mi.UInt32, self._shape if shapes is None else shapes, curve) * 24 + start
+        return self.columns(frames, dr.gather(mi.UInt32, self._shape if shapes is None else shapes, curve), start)
+
+    @staticmethod
+    def columns(frames: mi.Float, shape: mi.UInt32, start: int = 0) -> list[mi.Vector3f]:
+        """Images of the axes, and of the origin, of the shapes with these numbers; by `to_world`, or, from 12 on, by
+        its inverse."""
+        first = shape * 24 + start
         return [mi.Vector3f(*(dr.gather(mi.Float, frames, first + 4 * i + j) for i in range(3))) for j in range(4)]
 
 

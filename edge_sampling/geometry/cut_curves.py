@@ -226,16 +226,16 @@ class CutCurves:
         n = dr.cross(b - a, c - a)
         solid = dr.norm(n) > dr.epsilon(mi.Float) * dr.norm(b - a) * dr.norm(c - a)
         n = dr.normalize(n)
-        m, u, v, exists = _conic(shape, n, dr.dot(n, a))
+        m, u, v, exists = conic(shape, n, dr.dot(n, a))
         sides = [dr.cross(n, corners[(k + 1) % 3] - corners[k]) for k in range(3)]
         bounds = [(h, -dr.dot(h, q)) for h, q in zip(sides, corners, strict=True)]
         end, slack = dr.select(shape.is_a(Kind.CYLINDER), mi.Float64(1), 0), mi.Float64(pairs.slack)
         for sign, w in ((end, slack), (-end, 1 + slack)):
             bounds.append((mi.Vector3d(0, 0, sign), dr.select(end > 0, w, 1)))
         at = [(dr.dot(h, u), dr.dot(h, v), dr.dot(h, m) + w) for h, w in bounds]
-        start, span, valid = _arc(at, slot)
+        start, span, valid = arc(at, slot)
         half = dr.safe_sqrt(dr.square(1 + slack) - dr.squared_norm(m))
-        line_start, line_span = _interval(at, half)
+        line_start, line_span = interval(at, half)
         disk = shape.is_a(Kind.DISK)
         start, span = dr.select(disk, line_start, start), dr.select(disk, line_span, span)
         return (
@@ -321,7 +321,7 @@ class CutCurves:
         return line_edges(edges, self.capacity, vertices + 4 * len(self._analytic))
 
 
-def _conic(shape: Surface, n: mi.Vector3d, d: mi.Float64) -> tuple[mi.Vector3d, mi.Vector3d, mi.Vector3d, mi.Bool]:
+def conic(shape: Surface, n: mi.Vector3d, d: mi.Float64) -> tuple[mi.Vector3d, mi.Vector3d, mi.Vector3d, mi.Bool]:
     """The curve in which the plane n·p = d cuts a shape, in its frame: m, u, v; and is there one?"""
     x = dr.abs(n.x) <= 0.5
     s = dr.normalize(dr.cross(n, mi.Vector3d(dr.select(x, 1, 0), dr.select(x, 0, 1), 0)))
@@ -337,7 +337,7 @@ def _conic(shape: Surface, n: mi.Vector3d, d: mi.Float64) -> tuple[mi.Vector3d, 
     return *(choose(*each) for each in zip((m, u, v), ellipse, line, strict=True)), exists
 
 
-def _arc(at: list, slot: mi.UInt32) -> tuple[mi.Float64, mi.Float64, mi.Bool]:
+def arc(at: list, slot: mi.UInt32) -> tuple[mi.Float64, mi.Float64, mi.Bool]:
     """Where an arc begins with a bound, how long it is, and is there one? at : A, B, C of each bound, which holds where
     A cos φ + B sin φ + C >= 0."""
     arcs = []
@@ -359,7 +359,7 @@ def _arc(at: list, slot: mi.UInt32) -> tuple[mi.Float64, mi.Float64, mi.Bool]:
     return start, span, valid
 
 
-def _interval(at: list, half: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+def interval(at: list, half: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
     """Start and length of the part of a line, from -half to half, where all bounds A s + C >= 0 hold."""
     lower, upper = mi.Float64(-half), mi.Float64(half)
     for A, _, C in at:

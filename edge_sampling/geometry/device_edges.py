@@ -9,7 +9,7 @@ import numpy as np
 from rimlight.edge_sampling.rays import lift, lift_beyond
 
 from .edges import EdgeKind, Edges
-from .grids import is_grid, slack_of
+from .grid_edges import GridEdges
 from .meshes import Geometry, bends_light, lets_rays_through
 
 #: Faces whose normals differ by less (sine of the angle) count as coplanar; vertex normals, as equal.
@@ -35,13 +35,6 @@ BESIDE_LINE = 1.25, 8
 #: large a cotangent. Closer, rays meet both faces at the same distance, up to rounding, often the one that faces away.
 BESIDE_SHARP = 0.5, 1000
 
-#: Beside edges that stand for the surface of a grid, in units of how far that is from them; and how far from the planes
-#: of the faces there it is met, relative to this.
-GRID, GRID_MET = 1.25, 8
-
-#: And at which cosine between its normal and that of a face.
-ALIKE = 0.5
-
 #: Which meshes glass and masks are.
 KINDS = bends_light, lets_rays_through
 
@@ -55,8 +48,7 @@ class DeviceEdges:
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
     _OF_EDGES = ("_ends", "_part", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
     _ANY = ("any_smooth", "_any_lines", "_any_split", "_any_joined", "_any_through", "_first_line")
-    _OF_GRIDS = ("any_grid", "_slack")
-    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", "_lines", *_ANY, *_OF_EDGES, *_OF_GRIDS))
+    DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", "_lines", "grids", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
         # Copied, since Dr.Jit maps NumPy's memory: two arrays on the same memory make `dr.freeze` record anew.
@@ -86,11 +78,8 @@ class DeviceEdges:
         #: Are there edges made of sides that lie on one another (`close_cracks`), and of which parts of these?
         self._any_joined = bool(edges.joined.any())
         number = lambda a: mi.Float(np.array(a, np.float32))
-        grids = np.array([is_grid(m) for m in geometry.meshes] or [False])[edges.mesh].all(1) & ~edges.is_line
-        #: Are there edges that stand for the surface of a grid? How far that may be from each; negative: it is no such.
-        self.any_grid = bool(grids.any())
-        slack = np.where(grids, slack_of(geometry)[edges.vertices[:, 0]].max(1), -1) if self.any_grid else None
-        self._slack = number(slack) if self.any_grid else None
+        #: Which edges stand for the surface of a grid.
+        self.grids = GridEdges(geometry, edges)
         ends = [[number(edges.part[:, side, k]) for k in (0, 1)] for side in (0, 1)]
         self._part = ends if self._any_joined else None
 
@@ -184,40 +173,32 @@ class DeviceEdges:
         line = dr.gather(mi.Bool, self._is_line, edge)
         covered = dr.gather(mi.Bool, self._few_faces, edge) & (covers[0] | covers[1])
         hidden = dr.select(fold, ~(shown[0] & shown[1]), covered & ~(shown[0] | shown[1]))
-        if self.any_grid:
-            there = [self.meets_grid(positions, edge, p, si) | self._lets_through(si) for si in met]
-            hidden = dr.select(self.is_of_grid(edge), ~(fold & there[0] & there[1]), hidden)
         return (
             dr.select(line, self._is_hidden_line(positions, edge, p, rays, met), hidden) if self._any_lines else hidden
         )
 
     # ---------------------- Of grids ----------------------
 
-    def is_of_grid(self, edge: mi.UInt32) -> mi.Bool:
-        """Which edges stand for the surface of a grid, which is somewhere close by?"""
-        return dr.gather(mi.Float, self._slack, edge) >= 0 if self.any_grid else mi.Bool(False)
-
-    def slack(self, edge: mi.UInt32) -> mi.Float:
-        """How far from edges what is rendered may lie: scene units; 0 but for grids."""
-        return GRID * dr.maximum(dr.gather(mi.Float, self._slack, edge), 0) if self.any_grid else mi.Float(0)
-
-    def meets_grid(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Does a ray meet the surface of a grid beside a point p of a crease?"""
-        first, second = (dr.normalize(n) for n in self.normals(positions, edge))
-        least, met = GRID_MET * self.slack(edge) + rounding(p, p), mi.Bool(False)
-        # What is behind an outline may lie in the plane of a face, but it is farther, or another side of it is seen.
-        near = dr.norm(si.p - p) <= sum(dr.norm(o - p) for o in self.opposite(positions, edge))
-        for n in (first, -second):
-            met |= (dr.abs_dot(n, si.p - p) <= least) & near & (dr.dot(n, si.n) > ALIKE)
-        return self.is_of_grid(edge) & si.is_valid() & met
+    def side_of_crease(
+        self,
+        positions: mi.Float,
+        normals: mi.Float,
+        edge: mi.UInt32,
+        t: mi.Float,
+        p: mi.Point3f,
+        si: mi.SurfaceInteraction3f,
+    ) -> mi.UInt32:
+        """See `GridEdges.side`, of the point p = (1 − t) a + t b. normals : see `grids.normals`."""
+        n = dr.normalize(dr.lerp(*self._points_of_side(normals, edge, 0), t))
+        return self.grids.side(edge, p, n, sum(dr.norm(o - p) for o in self.opposite(positions, edge)), si)
 
     def is_concave(self, positions: mi.Float, edge: mi.UInt32) -> mi.Bool:
         """Which edges of grids are bent inwards? As silhouettes, these count with the opposite sign."""
-        if not self.any_grid:
+        if not self.grids.any:
             return mi.Bool(False)
         a, b = self.end_points(positions, edge)
         first, second = self.opposite(positions, edge)
-        return self.is_of_grid(edge) & (dr.dot(dr.cross(b - a, first - a), second - a) > 0)
+        return self.grids.are(edge) & (dr.dot(dr.cross(b - a, first - a), second - a) > 0)
 
     # ---------------------- What they look like ----------------------
 
@@ -281,7 +262,7 @@ class DeviceEdges:
         as coplanar, or are not two. Detached."""
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         sine = dr.norm(dr.cross(first, second))
-        bends = dr.gather(mi.Bool, self._two_faces, edge) & (sine > COPLANAR) & ~self.is_of_grid(edge)
+        bends = dr.gather(mi.Bool, self._two_faces, edge) & (sine > COPLANAR) & ~self.grids.are(edge)
         return dr.select(bends, dr.square(sine), 0)
 
     def farther(
@@ -310,7 +291,6 @@ class DeviceEdges:
         margin, most = BESIDE_LINE
         corner = dr.select(of(self._few_faces), dr.select(inside & (sharp > 0), dr.minimum(sharp, most), 0), most)
         farther += dr.select(of(self._is_line), 0, margin * corner * lift(scene, p))
-        farther += self.slack(edge) if self.any_grid else 0
         return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
 
     def _overhang(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:
@@ -339,8 +319,8 @@ class DeviceEdges:
         """
         kind = dr.gather(mi.UInt32, self._kind, edge)
         other = (kind == int(EdgeKind.JUMP)) | (kind == int(EdgeKind.SPLIT))
-        if self.any_grid:
-            sine = dr.select(self.is_of_grid(edge) & (kind == int(EdgeKind.SMOOTH)), 0, sine)
+        if self.grids.any:
+            sine = dr.select(self.grids.are(edge) & (kind == int(EdgeKind.SMOOTH)), 0, sine)
         bent = dr.select(kind == int(EdgeKind.FLAT), 1, dr.square(sine))
         return dr.select(other, 1, dr.select(sine > COPLANAR, bent, 0))
 

@@ -33,6 +33,9 @@ class EdgeKind(IntEnum):
     SMOOTH = 3
 
 
+#: Height of a triangle, relative to its longest side, up to which it has no area.
+SLIVER = 1e-6
+
 #: The part of a side that an edge has: all of it.
 WHOLE = np.array([0, 1], np.float32)
 
@@ -98,10 +101,13 @@ class Weld:
 
     place : (V,), int64; number of the place of each vertex of `Geometry.positions`.
     tolerance : how far apart vertices at one place may be, scene units.
+    slivers : (S, 3), int64; the corners of the faces without area that were left out, the first of them between the
+        others.
     """
 
     place: np.ndarray
     tolerance: float
+    slivers: np.ndarray
 
     @property
     def first(self) -> np.ndarray:
@@ -119,7 +125,7 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
 
     Welding over the borders of meshes makes one edge of two that coincide, as where the walls of a room meet: sampled
     as two, its jump would count twice. Triangles that are degenerate after welding, and repeated triangles, are
-    ignored.
+    ignored, and so are those without area that lie along an open border, which would end twice there.
 
     Raises
     ------
@@ -137,7 +143,7 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
         values.append(meshes.vertex_values(mesh))
         offset += len(v)
     if not points:
-        return _no_edges(), Weld(np.zeros(0, np.int64), 0.0)
+        return _no_edges(), Weld(np.zeros(0, np.int64), 0.0, np.zeros((0, 3), np.int64))
     face, mesh_of_face = np.concatenate(face_list), np.concatenate(mesh_of_face)
     point = np.concatenate(points)
     width = max(t.shape[1] for t in values)
@@ -149,6 +155,7 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     rewelded, tolerance = _weld_close(point, weld, face, sides)
     if rewelded is not weld:
         weld, sides = rewelded, _pair_sides(rewelded, face)
+    face, sides, slivers = _without_open_slivers(point, weld, face, sides)
 
     face0, corner0, face1, corner1, count = sides
     i0, j0, o0 = _corners(face, face0, corner0)
@@ -179,7 +186,7 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
         part=np.broadcast_to(WHOLE, (len(face0), 2, 2)),
         joined=np.zeros(len(face0), bool),
     )
-    return edges, Weld(weld, tolerance)
+    return edges, Weld(weld, tolerance, slivers)
 
 
 def _inside_of_voxels(geometry: Geometry, ends: np.ndarray, mesh: np.ndarray) -> np.ndarray:
@@ -273,6 +280,32 @@ def _pair_sides(weld: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, ...]:
     h0 = order[first]
     h1 = order[first + np.minimum(count - 1, 1)]
     return alive[h0 // 3], h0 % 3, alive[h1 // 3], h1 % 3, count
+
+
+def _without_open_slivers(
+    point: np.ndarray, weld: np.ndarray, face: np.ndarray, sides: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
+    """Leave out the faces without area at open edges, one after the other.
+
+    Returns the faces, of which these have one corner alone; the sides of the rest; and see `Weld.slivers`.
+    """
+    none = np.zeros((0, 3), np.int64)
+    if not (sides[-1] == 1).any():
+        return face, sides, none
+    p = point[face].astype(np.float64)
+    along = np.roll(p, -1, 1) - p
+    squared = np.square(along).sum(2)
+    thin = np.linalg.norm(np.cross(along[:, 0], along[:, 1]), axis=1) <= SLIVER * squared.max(1)
+    rest, slivers = face.copy(), [none]
+    while True:
+        first, count = sides[0], sides[-1]
+        found = np.unique(first[(count == 1) & thin[first]])
+        if not len(found):
+            return rest, sides, np.concatenate(slivers)
+        between = (squared[found].argmax(1) + 2) % 3  # opposite to the longest side
+        slivers.append(np.take_along_axis(face[found], (between[:, None] + np.arange(3)) % 3, 1))
+        rest[found] = rest[found, :1]
+        sides = _pair_sides(weld, rest)
 
 
 def _corners(face: np.ndarray, f: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -13,8 +13,22 @@ FACES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (
 #: Edges of a voxel: their corners, in the sense of their axis.
 EDGES = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
 
+
+def _axis_across(first: int, second: int) -> int:
+    (a, b), (c, d) = EDGES[first], EDGES[second]
+    same = [k for k in range(3) if len({(corner >> k) & 1 for corner in (a, b, c, d)}) == 1]
+    return same[0] if same and first != second else -1
+
+
+#: The axis across the face of a voxel in which two of its edges lie; −1 where they lie in none.
+AXIS_OF_EDGE = np.repeat(np.arange(3), 4)
+ACROSS = np.array([[_axis_across(e, f) for f in range(12)] for e in range(12)])
+
 #: Steps of Newton's method from the mean of a loop to the surface.
 STEPS = 4
+
+#: Points of a line in the face of a voxel at which it is compared with the surface.
+PLACES = np.arange(1, 8) / 8
 
 
 @dataclass(frozen=True)
@@ -26,6 +40,8 @@ class Triangles:
     faces : (F, 3), uint32; counter-clockwise, as seen from where values are positive.
     slack : (V,); how far about each vertex the triangles are from the surface, in voxels.
     bend : (V,); by how much the gradient of the values turns across the voxels about each vertex, in radians.
+    lines : (L, 2), int64; the vertices of the lines on faces of voxels, the lower one first; in order.
+    across : (L,); the axis across that face. sag : (L,); how far from the line the surface is in the face, in voxels.
     """
 
     ends: np.ndarray
@@ -35,6 +51,9 @@ class Triangles:
     faces: np.ndarray
     slack: np.ndarray
     bend: np.ndarray
+    lines: np.ndarray
+    across: np.ndarray
+    sag: np.ndarray
 
 
 def _next_edges(f: np.ndarray) -> np.ndarray:
@@ -86,8 +105,7 @@ def triangulate(values: np.ndarray) -> Triangles:
     # ---------------------- Vertices on edges of voxels ----------------------
 
     a, b = np.array(EDGES).T
-    axis = np.repeat(np.arange(3), 4)
-    key = corners[:, a] * 3 + axis
+    key = corners[:, a] * 3 + AXIS_OF_EDGE
     used, place = np.unique(key[voxel, edge], return_inverse=True)
     ends = np.stack([used // 3, used // 3 + stride[used % 3]], 1)
     number = np.full((len(base), 12), -1)
@@ -127,7 +145,25 @@ def triangulate(values: np.ndarray) -> Triangles:
         around = most[faces].max(1)
         for k in range(3):
             np.maximum.at(most, faces[:, k], around)
-    return Triangles(ends, used % 3, corners[inside], middle, faces.astype(np.uint32), slack, bend)
+    across = ACROSS[edge, after]
+    lines, first = np.unique(np.sort(faces[:, :2], axis=1), axis=0, return_index=True)
+    on_faces = lines, across[first], _sag(f[voxel[first]], p[first], q[first], across[first])
+    return Triangles(ends, used % 3, corners[inside], middle, faces.astype(np.uint32), slack, bend, *on_faces)
+
+
+def _sag(f: np.ndarray, p: np.ndarray, q: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """How far from the line between p and q, (N, 3), the surface is in the face of a voxel: (N,), at most 1. Across the
+    line, values in the face are quadratic. f : values at the corners, (N, 8). across : the axis across the face."""
+    along, most = q - p, np.zeros(len(p))
+    length = np.linalg.norm(along, axis=1)
+    aside = np.cross(along, np.eye(3)[across]) / np.where(length > 0, length, 1)[:, None]
+    for t in PLACES:
+        x = p + t * along
+        before, here, behind = (_trilinear(f, x + s * aside)[0] for s in (-1, 0, 1))
+        A, B = 0.5 * (before + behind) - here, 0.5 * (behind - before)
+        root = -0.5 * (B + np.copysign(np.sqrt(np.maximum(B * B - 4 * A * here, 0)), B))
+        most = np.maximum(most, np.abs(here) / np.maximum(np.abs(root), 1e-30))
+    return np.minimum(most, 1)
 
 
 def _turn(values: np.ndarray) -> np.ndarray:

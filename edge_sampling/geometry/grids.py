@@ -78,6 +78,12 @@ class SurfaceOfGrid:
         matrix = np.array(dr.detach(mi.traverse(self.inner)["to_world"].matrix), float).reshape(4, 4)[:3, :3]
         return self._renew().slack * (np.linalg.svd(matrix, compute_uv=False)[0] / (self.size - 1))
 
+    def lines(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The lines on faces of voxels: their vertices, (L, 2); the axis across the face; and how far from them, in the
+        face, the surface is: scene units. On the host."""
+        found = self._renew()
+        return found.lines, found.across, found.sag * self.voxel
+
     @property
     def window(self) -> np.ndarray:
         """How far from where smooth normals have it the outline may be, about each vertex: (V,), scene units, on the
@@ -87,9 +93,7 @@ class SurfaceOfGrid:
     @property
     def voxel(self) -> float:
         """The longest side of a voxel: scene units."""
-        matrix = np.array(dr.detach(mi.traverse(self.inner)["to_world"].matrix), float).reshape(4, 4)[:3, :3]
-        self._renew()
-        return float(np.linalg.norm(matrix, axis=0).max() / (self.size - 1))
+        return voxel_of(self.inner)
 
     @property
     def on_faces(self) -> int:
@@ -266,6 +270,23 @@ def slack_of(geometry: Geometry) -> np.ndarray:
     return np.concatenate([*slack, np.zeros(geometry.line_vertices)])
 
 
+def creases_of(geometry: Geometry, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of edges with these vertices, (E, 2): if they are lines on faces of voxels, how far from them, in the face, the
+    surface is, scene units, and the axis across the face; else −1 and 0. On the host."""
+    sag, across, start = np.full(len(ends), -1.0), np.zeros(len(ends), np.uint32), 0
+    wanted = np.sort(ends.astype(np.int64), axis=1)
+    for m in geometry.meshes:
+        count = m.vertex_count()
+        if is_grid(m):
+            lines, axis, off = m.lines()
+            key, of = (a[:, 0] * count + a[:, 1] for a in (lines, wanted - start))
+            at = np.minimum(np.searchsorted(key, of), len(key) - 1)
+            here = ((wanted >= start) & (wanted < start + count)).all(1) & (key[at] == of)
+            sag[here], across[here] = off[at[here]], axis[at[here]]
+        start += count
+    return sag, across
+
+
 class Grids:
     """Finds the grids of a scene, and keeps their triangles, so that frozen functions need not look for them."""
 
@@ -285,6 +306,13 @@ class Grids:
         known = {id(s) for s in grids}
         others = tuple(s for s in geometry.others if id(s) not in known)
         return replace(geometry, meshes=(*geometry.meshes, *self._surfaces), others=others)
+
+
+def voxel_of(grid: mi.Shape) -> float:
+    """The longest side of a voxel of an `sdfgrid`: scene units."""
+    params = mi.traverse(grid)
+    matrix = np.array(dr.detach(params["to_world"].matrix), float).reshape(4, 4)[:3, :3]
+    return float(np.linalg.norm(matrix, axis=0).max() / (params["grid"].shape[0] - 1))
 
 
 def is_cubic(shape: Any) -> bool:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .grids import voxel_of
 from .meshes import has_interpolated_normals, has_texcoords, is_flipped, objects_below
+
+#: How far on both sides of a point of a grid its normals are compared: in voxels.
+NEXT = 0.01
 
 
 class Surfaces:
     """The surfaces of a scene.
 
     Mitsuba 3.9 differentiates the normals of all shapes with respect to the texture coordinates, but interpolated
-    normals of meshes with respect to barycentric coordinates, and before `flip_normals` turns them round.
+    normals of meshes with respect to barycentric coordinates, and before `flip_normals` turns them round; and those of
+    grids not at all.
     """
 
     DRJIT_STRUCT = dict.fromkeys(())  # for `dr.freeze`
@@ -20,10 +25,14 @@ class Surfaces:
     def __init__(self, scene: mi.Scene):
         meshes = [o for o in objects_below(scene).values() if isinstance(o, mi.Mesh) and has_interpolated_normals(o)]
         self._any_other = any(has_texcoords(m) or is_flipped(m) for m in meshes)
+        #: Grids, and how far on both sides of a point their normals are compared.
+        self._grids = [(s, NEXT * voxel_of(s)) for s in scene.shapes() if s.class_name() == "SDFGrid"]
 
     def met(self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """What a ray meets; dn_du and dn_dv are derivatives with respect to the texture coordinates."""
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
+        for grid, step in self._grids:
+            self._differentiate(grid, step, si, ray, pi, active)
         if not self._any_other:
             return si
         on_mesh = active & pi.is_valid() & si.shape.is_mesh()
@@ -38,6 +47,22 @@ class Surfaces:
         )
         si.dn_du, si.dn_dv = dr.select(on_mesh, du, si.dn_du), dr.select(on_mesh, dv, si.dn_dv)
         return si
+
+    @staticmethod
+    def _differentiate(grid: mi.Shape, step: float, si, ray: mi.Ray3f, pi, active: mi.Bool) -> None:
+        """Give what is met on a grid two vectors that are tangent to it, and the differences of normals along them."""
+        on_grid = active & pi.is_valid() & (si.shape == mi.ShapePtr(grid))
+        found = []
+        for along in mi.coordinate_system(si.n):
+            normals = []
+            for sign in (-1, 1):
+                beside = mi.Ray3f(ray)
+                beside.o = ray.o + sign * step * along
+                normals.append(pi.compute_surface_interaction(beside, mi.RayFlags.All, on_grid).sh_frame.n)
+            found.append((mi.Vector3f(along), (mi.Vector3f(normals[1]) - mi.Vector3f(normals[0])) / (2 * step)))
+        (u, of_u), (v, of_v) = found
+        si.dp_du, si.dp_dv = dr.select(on_grid, u, si.dp_du), dr.select(on_grid, v, si.dp_dv)
+        si.dn_du, si.dn_dv = dr.select(on_grid, of_u, si.dn_du), dr.select(on_grid, of_v, si.dn_dv)
 
 
 def components(vector: mi.Vector3f, a: mi.Vector3f, b: mi.Vector3f) -> tuple[mi.Float, mi.Float]:

@@ -20,7 +20,6 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
-from rimlight.edge_sampling.geometry.cracks import has_open_sliver
 from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others
@@ -262,11 +261,11 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             "known: give the grid as many values along each axis as along the others."
         )
     hard = any(e.flags() & mi.EmitterFlags.Delta or hasattr(e, "light_count") for e in scene.emitters())
-    shaded = names(g.inner for g in grids_of(geometry) if moving.anything and (hard or not g.has_vertex_normals()))
+    shaded = names(g.inner for g in grids_of(geometry) if moving.anything and hard)
     if shaded:
         limits.append(
-            f"the derivative is off by up to a tenth in parts of the shading of {', '.join(shaded)} (sdfgrid): with "
-            "analytic normals; and in lights without a size, at the shadow that it throws on itself."
+            f"the derivative is off by up to a tenth in parts of the shading of {', '.join(shaded)} (sdfgrid), in "
+            "lights without a size, at the shadow that it throws on itself."
         )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:
@@ -281,12 +280,6 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
         limits.append(
             "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
             f"such nor meshes: {pairs}. Replace them by meshes."
-        )
-    doubled = names(s for s in moving.on_film if isinstance(s, mi.Mesh) and has_open_sliver(s))
-    if doubled:
-        limits.append(
-            f"the derivative may count part of the open borders of {', '.join(doubled)} twice, where faces without "
-            "area lie along them. Remove these faces."
         )
     pairs = [f'"{a.id()}" and "{b.id()}"' for a, b in cuts_of_grids(scene, geometry)]
     if pairs:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import cases
 import cuts
+import mitsuba as mi
 import numpy as np
 import pytest
 
+from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import EdgeKind, Geometry, close_cracks, find_welded_edges
 
 
@@ -82,3 +84,54 @@ def test_many_open_edges_take_seconds():
     p = rng.uniform(-1, 1, (100_000, 1, 3)) + rng.uniform(-0.01, 0.01, (100_000, 3, 3))
     edges, cracks, _ = joined(cases.mesh("soup", p.reshape(-1, 3), np.arange(300_000).reshape(-1, 3)))
     assert len(edges) == 300_000 and len(cracks) == 0
+
+
+# ---------------------- Faces without area ----------------------
+
+BOARD = [[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]]
+HALVES = [[0, 2, 1], [1, 2, 3]]
+
+
+def board(faces, *points):
+    return cases.mesh("board", [*BOARD, *points], [*HALVES, *faces], bsdf=cases.diffuse(0.5, two_sided=True))
+
+
+def open_sides(edges, mesh) -> set:
+    ends = Geometry((mesh,)).host_positions()[edges.vertices[edges.open, 0].astype(int)]
+    return {frozenset(map(tuple, pair)) for pair in ends.tolist()}
+
+
+@pytest.mark.parametrize("faces", [[[2, 4, 3]], [[2, 4, 3], [2, 5, 4]]])
+def test_faces_without_area_along_open_borders_are_left_out(faces):
+    """One of them, or two, one beside the other."""
+    bare, mesh = board([]), board(faces, [0.5, 1, 0], [0, 1, 0])
+    edges, cracks, _ = joined(mesh)
+    assert open_sides(edges, mesh) == open_sides(joined(bare)[0], bare)
+    assert len(edges) == 5 and len(cracks) == len(faces) and not cracks.widest()
+    np.testing.assert_allclose(cracks.at, [0.25, 1 / 3][: len(faces)])
+
+
+def test_a_face_without_area_stays_where_there_are_others_beyond_it():
+    edges, cracks, _ = joined(board([[2, 4, 3], [2, 5, 4], [4, 5, 3]], [0.5, 1, 0], [0, 2, 0]))
+    assert len(edges) == 10 and not len(cracks)
+
+
+def test_a_face_without_area_along_an_open_border_does_not_count():
+    """The border counted twice there. A vertex that leaves it makes a border of its own."""
+    scenes = [
+        cases.scene(sensor=cases.camera(), board=b, sky=cases.constant())
+        for b in (board([]), board([[2, 4, 3]], [0.5, 1, 0]))
+    ]
+    integrator = mi.load_dict({"type": "direct_edge"})
+    motion = {"key": "board.vertex_positions", "direction": [0.3, 1, 0.2]}
+    images = [np.array(derivative_image(s, integrator, Motion(s, **motion), spp=16)) for s in scenes]
+    assert np.abs(images[0]).max() > 0.1
+    np.testing.assert_allclose(images[1], images[0], atol=1e-4 * np.abs(images[0]).max())
+    assert len(integrator.search.edges) == 5
+    params = mi.traverse(scenes[1])
+    p = np.array(params["board.vertex_positions"]).reshape(-1, 3)
+    p[4, 1] += 0.2
+    params["board.vertex_positions"] = p.ravel()
+    params.update()
+    derivative_image(scenes[1], integrator, Motion(scenes[1], **motion), spp=1)
+    assert len(integrator.search.edges) == 7

@@ -63,34 +63,11 @@ def test_no_cut_of_the_far_plane_that_matters(far, key):
 
 # ---------------------- The near clipping plane ----------------------
 
-#: Shapes that go through a plane two units before the camera, and where that is in the frame.
-ANALYTIC = {
-    "sphere": {"type": "sphere", "center": [0.3, 0, -3], "radius": 0.5},
-    "disk": {"type": "disk"},
-    "cylinder": {"type": "cylinder", "p0": [-2, 0, -2.8], "p1": [2, 0, -2.8], "radius": 0.5},
-}
 
-
-def behind_the_near_plane(kind: str, near: float = 2.0, sensor: str = "perspective", aside: float = 0.0):
-    shape = {**ANALYTIC[kind], "id": "thing"}
-    if kind == "disk":
-        shape["to_world"] = mi.ScalarTransform4f().translate([0, 0, -3]).rotate([1, 0, 0], 60)
-    camera = cases.camera((aside, 0, -5), (aside, 0, 0), sensor, near_clip=near)
-    return cases.scene(sensor=camera, thing=shape, sky=cases.constant())
-
-
-@pytest.mark.parametrize("kind", ANALYTIC)
-@pytest.mark.parametrize("sensor", ["perspective", "orthographic"])
+@pytest.mark.parametrize("kind", ["sphere", "disk", "cylinder"])
 @pytest.mark.parametrize("key", ["thing.to_world", "sensor.to_world"])
-def test_cuts_of_the_near_plane_are_warned_about(kind, sensor, key):
-    (message,) = said(behind_the_near_plane(kind, sensor=sensor), key)
-    assert 'cut of the near clipping plane of "sensor" through "thing"; decrease its near_clip, now 2' in message
-
-
-@pytest.mark.parametrize("kind", ANALYTIC)
-@pytest.mark.parametrize("where", [{"near": 0.5}, {"near": 4.5}, {"aside": 12.0}])
-def test_no_cut_of_the_near_plane_in_the_frame(kind, where):
-    assert not said(behind_the_near_plane(kind, **where), "thing.to_world")
+def test_cuts_of_the_near_plane_are_no_limit(kind, key):
+    assert not said(cases.near_shape(kind)(), key)
 
 
 def test_far_plane_of_each_sensor():
@@ -320,17 +297,3 @@ def test_textures_that_slide_in_indirect_light(kind, options, missing):
     messages = said(as_written.checkered_board(), "board.vertex_texcoords", kind=kind, **options)
     assert len(messages) == missing
     assert all('in the light that "board" throw on other surfaces, the jumps of their textures' in m for m in messages)
-
-
-# ---------------------- Faces without area ----------------------
-
-
-@pytest.mark.parametrize("beyond", [False, True])
-def test_faces_without_area_along_open_borders(beyond):
-    """Such a face is no border where there are others beyond it."""
-    corners = [*as_written.CORNERS, [0, 0.9, 0.15], [0, 2, 0.15]]
-    faces = [[0, 2, 1], [1, 2, 3], [2, 4, 3], *([[2, 5, 4], [4, 5, 3]] if beyond else [])]
-    board = cases.mesh("board", corners, faces, bsdf=cases.diffuse(0.5, two_sided=True))
-    messages = said(cases.scene(sensor=cases.camera(), board=board, sky=cases.constant()), "board.vertex_positions")
-    assert len(messages) == (not beyond)
-    assert all('open borders of "board" twice' in message for message in messages)

@@ -823,7 +823,10 @@ ELSEWHERE = {
     "`ply`, `obj`, `serialized`": [test_files_equal_meshes_in_memory],
     "`rectangle`": ["room_floor_turns", "room_cube"],
     "`cube`": ["cube_depth"],
-    "`sdfgrid`": ["grid_slides", "grid_slides_gaussian", "grid_grows", "grid_lamp", "grid_along_axis"],
+    "`sdfgrid`": [
+        "grid_slides", "grid_slides_gaussian", "grid_grows", "grid_lamp", "grid_along_axis", "grid_of_flat_normals",
+        "grid_that_ends",
+    ],
     "`merge`": [test_merged_shapes_equal_their_parts],
     "`instance` of meshes": ["chair_slides", "chair_turns", "stretched_ball", test_something_passes_an_instance],
     "`instance` of other shapes; what is in a `shapegroup`": [test_something_passes_an_instance],
