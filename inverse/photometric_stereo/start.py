@@ -89,6 +89,8 @@ def guess(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options)
     for _ in range(3 if options.exposures else 0):
         predicted = least_squares.predicted(solve(values / exposures, directions), directions)
         exposures *= calibration.exposures(values / exposures, predicted, counts, plane.mean_directions())
+    if options.exposures:
+        exposures = calibration.with_trend(exposures, values, counts, directions)
     found = solve((values / exposures).astype(np.float64), directions)
     normals, albedo = least_squares.facing(found), np.linalg.norm(found, axis=1)
     weights = np.zeros((len(lobes), 3))

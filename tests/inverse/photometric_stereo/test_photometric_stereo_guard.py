@@ -166,7 +166,7 @@ def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(found.guess.normals[far[0]], found.start[far[0]], atol=0.01)
     assert min(np.abs(found.guess.normals[far[1]] - n[far[1]]).max() for n in states) < 1e-6
     assert found.taken_back == pytest.approx(0.5, abs=0.1)
-    assert "of the surface is taken back" in output.judgement(found)[-1]
+    assert "of the surface, the normals are those of the start" in output.judgement(found)[-1]
 
 
 def test_a_result_must_win_in_all() -> None:
@@ -307,7 +307,7 @@ def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "metadata.json").read_text("utf-8"))["materials"] == "several"
     report.write(tmp_path, found, options, title="colours", status="finished")
     text = (tmp_path / "report.html").read_text("utf-8")
-    assert "Diffuse colours" in text and "values that were left out are predicted" in text
+    assert "Diffuse colours" in text and "Values that were left out are predicted" in text
 
 
 def test_maps_of_a_result(matte: Dataset) -> None:
@@ -356,7 +356,7 @@ def test_few_lights_end_no_worse_than_they_start(K: int) -> None:
     before = angles(begun, data.truth).mean()
     if K == 3:
         np.testing.assert_array_equal(found.guess.normals, begun)
-        assert found.verdict == "not judged" and "the start is kept" in output.judgement(found)[0]
+        assert found.verdict == "not judged" and "The start is kept" in output.judgement(found)[0]
     else:
         assert found.verdict in ("judged", "start") and np.isfinite(found.left_out["result"])
         assert found.error < before + 0.05
