@@ -266,7 +266,11 @@ def _reflectance(view: View, result: Result) -> str:
     else:
         colours = pictures.to_srgb(view.image(view.guess.base / max(float(view.guess.base.max()), 1e-12)))
         colours = _masked(colours, view.data.mask[view.crop])
-        albedo = f'<div class="maps">{_figure(colours, "Diffuse colours, the brightest is 1")}</div>'
+        glaze = np.nan_to_num(view.image(view.guess.albedo, np.nan))[..., None].repeat(3, -1)
+        glaze = _masked(pictures.to_srgb(glaze), view.data.mask[view.crop])
+        of_glaze = f"Glaze: on {100 * result.guess.albedo.mean():.0f} % of the surface, which are white"
+        figures = [_figure(colours, "Diffuse colours, the brightest is 1"), _figure(glaze, of_glaze)]
+        albedo = f'<div class="maps">{"".join(figures)}</div>'
     table = page.table(
         ("lobe", "roughness (alpha)", "index of refraction", "red", "green", "blue"), rows, "Weights of the lobes"
     )

@@ -112,4 +112,5 @@ def refined(guess: Guess, domain: Domain, data: Dataset, *, before: int, now: in
     at = [centre(rows), centre(columns)]
     fine = [ndimage.map_coordinates(padded[..., i], at, order=1, mode="nearest") for i in range(padded.shape[2])]
     base = None if guess.base is None else np.stack(fine[4:], 1)
-    return replace(guess, normals=unit(np.stack(fine[:3], 1)), albedo=fine[3], base=base)
+    albedo = fine[3] if base is None else np.round(fine[3])  # of a glaze: there is one, or there is none
+    return replace(guess, normals=unit(np.stack(fine[:3], 1)), albedo=albedo, base=base)

@@ -234,6 +234,24 @@ def glazed(plastic: Scene) -> tuple[Dataset, Guess]:
     return dataclasses.replace(plastic.data, values=values), truth
 
 
+def test_where_a_glaze_is(plastic: Scene) -> None:
+    """Of an object with a glaze on its upper half, normals of the lower half lean, as if there were one, too."""
+    data, truth = glazed(plastic)
+    upper = np.nonzero(data.mask)[0] < data.mask.shape[0] // 2
+    truth.albedo = np.where(upper, 1.0, 0.0)
+    data = dataclasses.replace(data, values=plastic.model().predicted(truth).astype(np.float32))
+    model, lobes = plastic._replace(data=data).model(), plastic.rendering.lobes
+    options, kind = reconstruction.Options(max_depth=2), Kind(several=True, coat=True)
+    work = Alternations(data, lobes, kind, judge_of(data, lobes), options, np.random.default_rng(0))
+    guess = dataclasses.replace(deepcopy(truth), albedo=np.ones_like(truth.albedo))
+    model.fit_normals(guess, steps=6)
+    before = angles(guess.normals, truth.normals)
+    work._glaze(guess, model)
+    after = angles(guess.normals, truth.normals)
+    assert (guess.albedo == truth.albedo).mean() > 0.95
+    assert before[~upper].mean() > 1 and after.mean() < 0.2 * before[~upper].mean()
+
+
 def test_colours_under_a_glaze(plastic: Scene) -> None:
     """They are found with the normals and the glaze, none of which one material times a factor explains."""
     data, truth = glazed(plastic)

@@ -33,7 +33,7 @@ from rimlight.inverse.photometric_stereo import (
 )
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import Guess
-from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
+from rimlight.inverse.photometric_stereo.evidence import FAR, Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering, unlit
 from rimlight.inverse.photometric_stereo.vectors import unit
 
@@ -182,6 +182,14 @@ def test_a_result_must_win_in_all() -> None:
     assert not nothing.beats(nothing)
 
 
+def test_a_result_whose_halves_have_nothing_in_common_is_not_taken() -> None:
+    """However much better it is than the start."""
+    state = lambda halves: alternation.State(None, None, Kind(), left_out=0.3, halves=halves, curl=2.0)
+    start = dataclasses.replace(state(26.0), left_out=0.4)
+    assert state(FAR / 2 - 0.1).beats(start)
+    assert not state(FAR / 2 + 0.1).beats(start)
+
+
 def test_other_materials_must_be_clearly_better() -> None:
     """By more than a standard error, and predictions and halves of the lights together by a part."""
     state = lambda left_out, halves, kind: alternation.State(
@@ -307,7 +315,8 @@ def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "metadata.json").read_text("utf-8"))["materials"] == "several"
     report.write(tmp_path, found, options, title="colours", status="finished")
     text = (tmp_path / "report.html").read_text("utf-8")
-    assert "Diffuse colours" in text and "Values that were left out are predicted" in text
+    for said in ("Diffuse colours", "Glaze: on 100 % of the surface", "Values that were left out are predicted"):
+        assert said in text
 
 
 def test_maps_of_a_result(matte: Dataset) -> None:
