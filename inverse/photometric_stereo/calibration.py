@@ -225,7 +225,7 @@ def with_trend(exposures: np.ndarray, values: np.ndarray, counts: np.ndarray, li
 
 def of_matte(values: np.ndarray, counts: np.ndarray, lights: np.ndarray) -> np.ndarray:
     """Exposures of images of a matte surface, (K,), 0 of images that are black: those with which any normals and
-    albedos explain the values best (Cho et al. 2018), without the darkest and the brightest fifth of each pixel.
+    albedos explain the values best (Cho et al. 2020), without the darkest and the brightest fifth of each pixel.
 
     values, counts : (P, K). lights : directions, (K, 3) or (P, K, 3).
     """

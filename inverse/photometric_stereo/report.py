@@ -29,7 +29,7 @@ from .rendering import Rendering
 from .vectors import unit
 
 #: Largest width and height of pictures in the page, pixels.
-SHOWN = 240
+SHOWN = 320
 
 #: Photographs that are shown, and samples per pixel of what is rendered for the page.
 PHOTOGRAPHS, SPP = 4, 16
