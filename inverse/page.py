@@ -200,7 +200,7 @@ def shrunk(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def picture(image: np.ndarray, text: str, attributes: str = "") -> str:
-    """A picture: (H, W, C), linear, or (H, W, 3), uint8, as it is. text : for those who cannot see it."""
+    """A picture: (H, W, C), linear, or (H, W, 3 or 4), uint8, as it is. text : for those who cannot see it."""
     height = image.shape[0]
     if image.dtype != np.uint8:
         image = pictures.to_srgb(shrunk(image, WIDEST, height))

@@ -3,6 +3,7 @@
     python tests/random_photometric.py --seeds 0 200 --processes 2 --out rows.jsonl      # about a minute a set
     python tests/random_photometric.py --only 17
     python tests/random_photometric.py --table rows.jsonl
+    python tests/random_photometric.py --exposures --seeds 1000 1132      # starts only, of sets with 20 lights and more
 
 A set has a shape, one to three materials, 8 to 96 lights and noise, and some of: wrong exposures, wrong lights, images
 that are missing, values that are clipped or black, light from all around, a mask with holes or a wrong border, pictures
@@ -31,7 +32,7 @@ from scipy import ndimage
 
 from rimlight import ggx
 from rimlight.inverse import photometric_stereo as ps
-from rimlight.inverse.photometric_stereo import simulation, start
+from rimlight.inverse.photometric_stereo import calibration, plausibility, simulation, start
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.vectors import unit
 from rimlight.inverse.targets import srgb_to_linear
@@ -276,6 +277,22 @@ def run(seed: int) -> Row:
     return row
 
 
+def exposures(seed: int) -> tuple[float, float] | None:
+    """Errors of the start with exposures without a trend, and with what `calibration.with_trend` gives back. None of
+    sets with so few lights that no exposures are estimated."""
+    if _scene(np.random.default_rng([seed, 71]), seed).lights < calibration.FEWEST:
+        return None
+    data, options, row = make(seed)
+    data = plausibility.checked(data)
+    counts, lobes = start.counts(data, data, 1.0, options.dark), ggx.read_dictionary()[0]
+    known, errors, with_trend = np.linalg.norm(data.truth, axis=1) > 0.5, [], calibration.with_trend
+    for given_back in (lambda found, *_: found, with_trend):
+        calibration.with_trend = given_back
+        errors.append(float(angles(start.guess(data, lobes, counts, options).normals, data.truth)[known].mean()))
+    print(f"{seed} {errors[0]:6.2f} -> {errors[1]:6.2f}: {row.label}; {', '.join(row.faults)}", flush=True)
+    return errors[0], errors[1]
+
+
 def table(rows: list[dict]) -> str:
     """Of sets with what they have in common, a line each."""
     groups: dict[str, list[dict]] = {"all": rows}
@@ -312,6 +329,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, help="rows as JSON, one a line; seeds that it has are not repeated")
     parser.add_argument("--table", type=Path, nargs="+", help="make a table of such files, and nothing else")
+    parser.add_argument("--exposures", action="store_true", help="what a trend of the exposures does to starts")
     args = parser.parse_args()
     if args.table:
         print(table([json.loads(line) for file in args.table for line in file.read_text("utf-8").splitlines()]))
@@ -323,6 +341,13 @@ def main() -> None:
     if args.out and args.out.exists():
         known = {json.loads(line)["seed"] for line in args.out.read_text("utf-8").splitlines()}
         seeds = [s for s in seeds if s not in known]
+    if args.exposures:
+        both = np.array([errors for seed in seeds if (errors := exposures(seed)) is not None])
+        change = both[:, 1] - both[:, 0]
+        print(f"{len(both)} sets, mean {both[:, 0].mean():.2f} -> {both[:, 1].mean():.2f} degrees")
+        print(f"{(change < -WORSE).sum()} better and {(change > WORSE).sum()} worse by more than {WORSE}")
+        print(f"largest changes {change.min():.2f} and {change.max():.2f}")
+        return
     if args.processes > 1:
         command = [sys.executable, __file__, *(["--out", str(args.out)] if args.out else []), "--only"]
         parts = [seeds[k :: args.processes] for k in range(args.processes)]

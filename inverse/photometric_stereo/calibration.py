@@ -11,12 +11,16 @@ from tqdm import tqdm
 
 from rimlight.edge_sampling.refusals import InputError
 
+from . import least_squares
 from .files import DIRECTIONS, INTENSITIES, read_camera, read_mask, read_names, read_pixels
 from .integration import ray_matrix
 from .vectors import LUMINANCE, unit
 
 #: As many images as a quadratic polynomial over light directions needs to be told from single exposures.
 FEWEST = 20
+
+#: Unknowns of this polynomial, but for its constant; and pixels from which the exposures of a matte surface are found.
+TREND, SAMPLED = 5, 1000
 
 #: The highlight of a chrome ball is what is brighter than this part of its brightest pixel; light of a small source
 #: comes from directions that scatter by less than this (root mean square), degrees.
@@ -194,6 +198,53 @@ def calibrate(folder: Path, ball: Path, kind: Literal["chrome", "matte"]) -> tup
 
 
 # ---------------------- Exposures ----------------------
+
+
+def with_trend(exposures: np.ndarray, values: np.ndarray, counts: np.ndarray, lights: np.ndarray) -> np.ndarray:
+    """Exposures, (K,), median 1, to which a trend over the directions of the lights is given back, if there is one.
+
+    Exposures that are off at random follow a trend, too, by chance, and `exposures` takes it for the material's. Of a
+    matte surface, `of_matte` tells it; of another one, what this finds is the material's as well. How large is a trend
+    by chance? As large as the standard error of a fit of least absolute residuals, which follows from the spread of the
+    exposures between their quartiles. That part of the difference, in squares, is taken to be the exposures'.
+
+    exposures : as of `exposures`, all of them. values : (P, K), as they are in the images. counts, lights : see there.
+    """
+    with np.errstate(divide="ignore"):
+        change = np.log(of_matte(values / exposures, counts, lights))
+    known = np.isfinite(change)
+    if known.sum() < FEWEST:
+        return exposures
+    change = np.where(known, change - np.median(change[known]), 0)
+    spread = np.subtract(*np.quantile(np.log(exposures[known]), (0.75, 0.25)))
+    by_chance = spread**2 * TREND / known.sum()
+    share = min(by_chance / max(np.square(change[known]).mean(), 1e-30), 1)
+    found = exposures * np.exp(share * change)
+    return found / np.median(found)
+
+
+def of_matte(values: np.ndarray, counts: np.ndarray, lights: np.ndarray) -> np.ndarray:
+    """Exposures of images of a matte surface, (K,), 0 of images that are black: those with which any normals and
+    albedos explain the values best (Cho et al. 2020), without the darkest and the brightest fifth of each pixel.
+
+    values, counts : (P, K). lights : directions, (K, 3) or (P, K, 3).
+    """
+    pixels = np.unique(np.linspace(0, len(values) - 1, SAMPLED).astype(int))
+    values = values[pixels] / np.maximum(values[pixels].mean(1, keepdims=True), 1e-30)
+    lights = lights if lights.ndim == 2 else lights[pixels]
+    rank = least_squares.ranks(values)
+    weighted = values * ((rank >= 0.2) & (rank <= 0.8) & (counts[pixels] > 0))
+    # values / exposures - lights @ b is to be small; b is eliminated, and what is left is quadratic in 1 / exposures
+    A = weighted[..., None] * lights
+    M = np.einsum("pki,pkj->pij", (weighted > 0)[..., None] * lights, np.broadcast_to(lights, A.shape))
+    squares = (weighted * values).sum(0)
+    left = np.diag(squares) - np.tensordot(A, A @ np.linalg.pinv(M, rcond=1e-6, hermitian=True), ((0, 2), (0, 2)))
+    shown = squares > 0
+    size = np.sqrt(squares[shown])
+    _, vectors = np.linalg.eigh(left[np.ix_(shown, shown)] / size / size[:, None])
+    found = np.zeros(len(squares))
+    found[shown] = size / np.abs(vectors[:, 0])
+    return found
 
 
 def exposures(values: np.ndarray, predicted: np.ndarray, counts: np.ndarray, lights: np.ndarray) -> np.ndarray:

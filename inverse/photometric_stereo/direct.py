@@ -5,10 +5,10 @@ The model of the value of pixel p under light k, a colour:
     V_pk s_k E_pk (a_p f(n_p; l_pk, v_p) + b_p g(n_p; l_pk, v_p)) max(n_p · l_pk, 0) + I_pk
 
 with exposure s, irradiance E over the intensity of the light, visibility V, and indirect light I. Of one material, a is
-the albedo of pixels, relative to the BSDF f, and b is 0. Of several under one glaze, a is 1, f has glossy lobes only,
-and b is the colour of a diffuse lobe g, a pixel's own (Lambertian, or under a smooth coat). Given f, each pixel has
-three unknowns, or five, found by damped Gauss-Newton steps; given these, the weights of a dictionary are a non-negative
-least squares problem. Residuals count by Huber's loss.
+the albedo of pixels, relative to the BSDF f, and b is 0. Of several under one glaze, a is 1, or 0 where there is no
+glaze, f has glossy lobes only, and b is the colour of a diffuse lobe g, a pixel's own (Lambertian, or under a smooth
+coat). Given f, each pixel has three unknowns, or five, found by damped Gauss-Newton steps; given these, the weights of
+a dictionary are a non-negative least squares problem. Residuals count by Huber's loss.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ SAMPLED, RIDGE = 2000, 1e-6
 
 @dataclass
 class Guess:
-    """What is sought, but depth. normals : (P, 3). albedo : (P,). exposures : (K,). weights : (B, 3), of the BSDF.
-    base : (P, 3), the diffuse colours of several materials under one glaze, or None, of one material. base_eta : the
-    index of refraction of the coat over them; NaN: they are Lambertian."""
+    """What is sought, but depth. normals : (P, 3). albedo : (P,); of several materials, 1 where the glaze is, else 0.
+    exposures : (K,). weights : (B, 3), of the BSDF. base : (P, 3), the diffuse colours of several materials under one
+    glaze, or None, of one material. base_eta : the index of refraction of the coat over them; NaN: they are
+    Lambertian."""
 
     normals: np.ndarray
     albedo: np.ndarray

@@ -133,27 +133,32 @@ def write_pictures(folder: Path, result: Result) -> None:
 def judgement(result: Result) -> list[str]:
     """What the values that were left out say, in sentences; nothing before the last alternation."""
     if result.verdict == "not judged":
-        kept = "too few lights to leave any out: the start is kept, for nothing tells if another result is better"
+        kept = "The start is kept: of so few lights none can be left out, so nothing tells if another result is better."
         return [kept] if result.left_out else []
     start, found = (f"{100 * result.left_out[name]:.3g} %" for name in ("start", "result"))
     if result.verdict == "start":
         return [
-            "the start is kept, for nothing predicts values that were left out better and has normals that depend less "
-            f"on which lights tell them and are those of a surface: {start} off"
+            "The start is kept. No other state predicts values that were left out better, has normals that depend less "
+            "on which lights tell them, and whose normals are those of a surface as well.",
+            f"The start predicts values that were left out with a mean error of {start} of the mean value of a pixel.",
         ]
-    sentences = [f"values that were left out are predicted {found} off, by the start {start}"]
+    sentences = [
+        f"Values that were left out are predicted with a mean error of {found} of the mean value of a pixel; the start "
+        f"predicts them with {start}."
+    ]
     if np.isfinite(list(result.halves.values())).all():
         start, found = (f"{result.halves[name]:.2g}°" for name in ("start", "result"))
         sentences.append(
-            f"normals of one half of the lights and of the other differ by {found}, at the start by {start}"
+            f"Normals from one half of the lights and normals from the other half differ by {found}; those of the "
+            f"start differ by {start}."
         )
     if np.isfinite(result.strength):
         sentences.append(
-            f"interreflections count {result.strength:.2g} times what the surface that was found makes: so bright is "
-            "its shadow in the images"
+            f"Interreflections of the surface that was found are multiplied by {result.strength:.2f}, so that shadows "
+            "are as bright as in the images."
         )
     if result.taken_back > 0:
-        sentences.append(f"{100 * result.taken_back:.2g} % of the surface is taken back to the start")
+        sentences.append(f"On {100 * result.taken_back:.2g} % of the surface, the normals are those of the start.")
     return sentences
 
 

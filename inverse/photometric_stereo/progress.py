@@ -41,7 +41,7 @@ class Progress:
     level : number of the size of the images. kind : of the material with which its alternations begin.
     trial : which alternations of this size: 0 with that kind, then those of other kinds of material.
     start : of this size, judged. settled : result of trial 0. best : of the trials that ended. course : of this trial.
-    first : normals of the first start. back : part of the surface that was taken back to the start at the end.
+    back : part of the surface that was taken back to the start at the end.
     history, seconds : as of `Result`.
     """
 
@@ -52,7 +52,6 @@ class Progress:
     settled: State | None = None
     best: State | None = None
     course: Course | None = None
-    first: np.ndarray | None = None
     back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -105,7 +104,6 @@ class Checkpoint:
         if (course := now.course) is not None:
             states |= {"newest": course.state, "best of course": course.best}
             facts["course"] = {name: getattr(course, name) for name in NUMBERS}
-            arrays |= {"first": now.first}
             arrays |= {} if course.indirect is None else {"indirect": course.indirect}
         facts["states"] = {}
         for name, state in states.items():
@@ -140,7 +138,7 @@ class Checkpoint:
             newest, best = states.pop("newest"), states.pop("best of course")
             course = Course(newest, best=best, indirect=arrays.get("indirect"), **facts["course"])
         same = {name: facts[name] for name in ("level", "trial", "history", "seconds")}
-        return Progress(kind=Kind(*facts["kind"]), **states, course=course, first=arrays.get("first"), **same)
+        return Progress(kind=Kind(*facts["kind"]), **states, course=course, **same)
 
     def _check(self, facts: dict[str, Any]) -> None:
         """Raises ValueError if a checkpoint belongs to something else, and says what differs."""

@@ -131,13 +131,13 @@ class Options:
 
 @dataclass
 class Result:
-    """normals : (P, 3). depth : (Q,), of the pixels of `domain`. weights : (B, 3), with `scale` the BSDF of the images.
-    kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and so was kept;
-    "judged", if something else predicts better; "not judged", with too few lights to leave any out, and the start was
-    kept. left_out : how far predictions of "start" and "result" are off, in the mean value of each pixel. halves :
-    of both, the mean angle between normals of one half of the lights and of the other, degrees. curl : of both,
-    that between normals and those of the depth that is integrated from them. taken_back : part of the surface whose
-    normals are those of the start.
+    """start : its normals, (P, 3). depth : (Q,), of the pixels of `domain`. weights : (B, 3), with `scale` the BSDF of
+    the images. kind : of its material. verdict : "start", if that predicts what was left out as well as anything, and
+    so was kept; "judged", if something else predicts better; "not judged", with too few lights to leave any out, and
+    the start was kept. left_out : how far predictions of "start" and "result" are off, in the mean value of each pixel.
+    halves : of both, the mean angle between normals of one half of the lights and of the other, degrees. curl : of
+    both, that between normals and those of the depth that is integrated from them. taken_back : part of the surface
+    whose normals are those of the start.
     strength : by which factor interreflections were multiplied, for shadows to be as they are in the images; NaN if
     there are too few of these, and so they were left as they are.
     doubts : what is probably wrong with the data, in sentences. history : for each alternation, the size of the images,
@@ -299,7 +299,6 @@ class Reconstruction:
         guess = start.guess(work.data, self.lobes, work.judge.counts, options)
         now.start, view = work.judged_start(guess, start.flat(work.data).lighting(), self.kinds)
         if coarse is None:
-            now.first = guess.normals
             now.course = Course(copy.deepcopy(now.start), most)
             return None if work.kind.several else view  # of several, the guess is another one
         sides = [round(1 / options.resolutions[i]) for i in (now.level - 1, now.level)]
@@ -337,7 +336,7 @@ class Reconstruction:
             best.guess,
             best.depth,
             work.domain,
-            now.first,
+            now.start.guess.normals,
             self.scale,
             best.kind,
             verdict="not judged" if not work.judge.able else "start" if best.start else "judged",

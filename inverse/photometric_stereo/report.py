@@ -20,8 +20,8 @@ from rimlight.inverse import page
 from rimlight.inverse.page import number
 from rimlight.sys_info import processor
 
-from . import least_squares, output
-from .dataset import LUMINANCE, Dataset
+from . import output
+from .dataset import Dataset
 from .direct import Guess
 from .integration import normals_of
 from .reconstruction import Options, Result
@@ -29,7 +29,7 @@ from .rendering import Rendering
 from .vectors import unit
 
 #: Largest width and height of pictures in the page, pixels.
-SHOWN = 240
+SHOWN = 320
 
 #: Photographs that are shown, and samples per pixel of what is rendered for the page.
 PHOTOGRAPHS, SPP = 4, 16
@@ -68,19 +68,21 @@ for (const relit of document.querySelectorAll(".relit")) {
 class View:
     """A result at the size of the page, with a few of its images only: `data` and `guess` have K' of these.
 
-    depth : (P',), as of `integrate`. chosen : (K',), numbers of these images. start : (P', 3), normals by the
-    method of the start, or None. crop : of images.
+    step : side of a pixel of the page, in pixels of the result. mean : of what pixels of the result have, (P, ...),
+    over those of the page, (P', ...). depth : (P',), as of `integrate`. chosen : (K',), numbers of these images.
+    crop : of images.
     """
 
     data: Dataset
     guess: Guess
+    step: int
+    mean: Callable[[np.ndarray], np.ndarray]
     depth: np.ndarray
     chosen: np.ndarray
-    start: np.ndarray | None
     crop: tuple[slice, slice]
 
     @staticmethod
-    def of(result: Result, options: Options) -> View:
+    def of(result: Result) -> View:
         data, guess = result.data, result.guess
         chosen = np.unique(np.linspace(0, len(data.lights) - 1, PHOTOGRAPHS).round().astype(int))
         step = -(-max(np.ptp(np.nonzero(data.mask), axis=1) + 1) // SHOWN)
@@ -91,10 +93,6 @@ class View:
         else:
             mean = data.blocks(step)[1]
         depth = mean(output.depth(result)) / (step if data.camera is None else 1)
-        start = None
-        if not data.near:
-            values = np.stack([mean(data.values[:, k] @ LUMINANCE) for k in range(len(data.lights))], 1)
-            start = least_squares.normals(values / guess.exposures, data.lights, options.start)
         found = dataclasses.replace(
             guess,
             normals=unit(mean(guess.normals)),
@@ -104,7 +102,7 @@ class View:
         )
         rows, columns = np.nonzero(small.mask)
         crop = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-        return View(small, found, depth, chosen, start, crop)
+        return View(small, found, step, mean, depth, chosen, crop)
 
     def image(self, pixels: np.ndarray, fill: float = 0) -> np.ndarray:
         return self.data.image(pixels, fill)[self.crop]
@@ -119,9 +117,9 @@ def write(
     ------
     OSError
     """
-    view = View.of(result, options)
+    view = View.of(result)
     sections = [
-        f"<style>{STYLE}</style>\n<header>\n<h1>{html.escape(title)}</h1>\n{_verdict(view, result, status)}\n</header>",
+        f"<style>{STYLE}</style>\n<header>\n<h1>{html.escape(title)}</h1>\n{_verdict(result, status)}\n</header>",
         _shape(view, result, truth),
         *_rendered(view, result, options),
         _progress(result),
@@ -136,38 +134,48 @@ def write(
 # ------------------------------------------------------------------ sections
 
 
-def _verdict(view: View, result: Result, status: str) -> str:
-    facts = [f"{len(result.history)} alternations in {result.seconds:.3g} s"]
+def _verdict(result: Result, status: str) -> str:
+    facts = f"{len(result.history)} alternations in {result.seconds:.3g} s"
     if result.error is not None:
-        facts.append(f"mean angular error {result.error:.2f}°")
-        if view.start is not None:
-            facts[-1] += f" (start: {np.nanmean(view.data.off(view.start)):.2f}°)"
-    facts.append(f"residual {number(100 * result.history[-1]['residual'], 2)} % of the median value")
-    facts += output.judgement(result)
+        facts += f"; mean angular error {result.error:.2f}° (start: {np.nanmean(result.data.off(result.start)):.2f}°)"
     kind = "status" if status == "finished" else "status bad"
+    residual = number(100 * result.history[-1]["residual"], 2)
+    said = [*output.judgement(result), f"The last alternation left a residual of {residual} % of the median value."]
+    listed = lambda sentences: "".join(f"<li>{html.escape(text)}</li>" for text in sentences)
     verdict = (
-        f'<p class="verdict"><span class="{kind}">{html.escape(status)}</span>: {html.escape("; ".join(facts))}</p>'
+        f'<p class="verdict"><span class="{kind}">{html.escape(status)}</span>: {html.escape(facts)}</p>\n'
+        f"<ul>{listed(said)}</ul>"
     )
-    items = "".join(f"<li>{html.escape(text)}</li>" for text in result.doubts)
-    return verdict + (f'\n<p>The data are doubtful:</p>\n<ul class="warnings">{items}</ul>' if items else "")
+    if not result.doubts:
+        return verdict
+    return f'{verdict}\n<p>The data are doubtful:</p>\n<ul class="warnings">{listed(result.doubts)}</ul>'
 
 
 def _shape(view: View, result: Result, truth: np.ndarray | None) -> str:
     data = view.data
-    maps = {"start": view.start, "result": view.guess.normals, "truth": data.truth}
-    maps = {name: normals for name, normals in maps.items() if normals is not None}
+    maps = {"start": unit(view.mean(result.start)), "result": view.guess.normals}
+    maps |= {} if data.truth is None else {"truth": data.truth}
     figures = [_figure(_coloured_normals(view.image(n, np.nan)), f"Normals: {name}") for name, n in maps.items()]
-    sections = [f'<section>\n<h2>Shape</h2>\n<div class="maps">{"".join(figures)}</div>']
+    sections = [
+        f'<section>\n<h2>Shape</h2>\n<div class="maps">{"".join(figures)}</div>\n<p>The more red, the further a normal '
+        "points to the right; the more green, the further up; the more blue, the further towards the camera.</p>"
+    ]
     if data.truth is not None:
-        errors = {name: data.off(n) for name, n in maps.items() if name != "truth"}
-        sections.append(_with_scale({f"Error: {name}": e for name, e in errors.items()}, view.image, "degrees"))
+        errors = {"start": result.data.off(result.start), "result": result.data.off(result.guess.normals)}
+        sections.append(_with_scale({f"Error: {name}": e for name, e in errors.items()}, view, "degrees"))
     depth = view.image(view.depth, np.nan)
     inside = np.isfinite(depth)
-    from_depth = normals_of(depth, inside, camera=_camera(view))
-    shaded = np.maximum(from_depth @ SHADING, 0)[..., None].repeat(3, -1)
-    figures = [_figure(pictures.to_srgb(shaded), "Depth, shaded"), _figure(_coloured(depth, "viridis"), "Depth")]
+    shaded = np.maximum(normals_of(depth, inside, camera=_camera(view)) @ SHADING, 0)[..., None].repeat(3, -1)
+    figures = [_figure(_masked(pictures.to_srgb(shaded), inside), "Depth, shaded")]
+    if data.camera is None:
+        colours, ends, of_depth = "viridis", view.step * _ends(depth), "pixels towards the camera; mean 0"
+    else:  # what is bright is near here, too
+        colours, ends, of_depth = "viridis_r", _ends(depth), "distance along the axis of the camera, "
+        of_depth += "geometric mean 1" if data.distance is None else "in the unit of distance.txt"
+    figures.append(_figure(_coloured(depth, colours), "Depth"))
     plot = "" if truth is None else _cross_section(result, truth)
-    return "\n".join([*sections, f'<div class="maps">{"".join(figures)}</div>\n{plot}\n</section>'])
+    both, scale = f'<div class="maps">{"".join(figures)}</div>', _scale(colours, *ends, of_depth)
+    return "\n".join([*sections, both, scale, plot, "</section>"])
 
 
 def _rendered(view: View, result: Result, options: Options) -> list[str]:
@@ -223,7 +231,8 @@ def _photographs(view: View, result: Result, images: np.ndarray) -> str:
             figures.append(_figure(pictures.to_srgb(view.image(values[:, i]) * gain), f"{name}: {what}"))
         coloured = _coloured(pictures.signed(difference), pictures.COLOUR_MAP, -limit, limit)
         figures.append(_figure(coloured, "rendering − photograph"))
-    scale = _scale(pictures.COLOUR_MAP, -limit, limit, "difference; the photographs reach up to about 1")
+    of_difference = "rendering − photograph, if the brightest parts of the photographs are 1"
+    scale = _scale(pictures.COLOUR_MAP, -limit, limit, of_difference)
     maps = f'<div class="maps">{"".join(figures)}</div>'
     return f"<section>\n<h2>Photographs and renderings</h2>\n{maps}\n{scale}\n</section>"
 
@@ -237,7 +246,7 @@ def _progress(result: Result) -> str:
     for title, (key, label) in curves.items():
         plots.append(_plot(title, seconds, [e[key] for e in result.history], "seconds", label, _sizes(result)))
     K = len(result.guess.exposures)
-    plots.append(_plot("Exposures", np.arange(1, K + 1), result.guess.exposures, "image", "exposure", linear=True))
+    plots.append(_plot("Exposures", np.arange(1, K + 1), result.guess.exposures, "image", "factor", linear=True))
     return f'<section>\n<h2>Progress and exposures</h2>\n<div class="plots">\n{"".join(plots)}</div>\n</section>'
 
 
@@ -247,23 +256,39 @@ def _reflectance(view: View, result: Result) -> str:
     rows = []
     order = np.argsort(-weights.max(1))
     for b in order[weights.max(1)[order] > 1e-4]:
-        lobe = "diffuse" if np.isnan(result.lobes.alpha[b]) else f"{result.lobes.alpha[b]:.3g}"
-        rows.append((lobe, f"{result.lobes.eta[b]:.3g}", *(f"{w:.4f}" for w in weights[b])))
+        alpha, eta = result.lobes.alpha[b], result.lobes.eta[b]
+        lobe = "glossy" if np.isfinite(alpha) else "diffuse, under a coat" if np.isfinite(eta) else "diffuse"
+        of_lobe = ("" if np.isnan(x) else f"{x:.3g}" for x in (alpha, eta))
+        rows.append((lobe, *of_lobe, *(f"{w:.4f}" for w in weights[b])))
     note = "" if factor == 1 else f" times {number(factor)}"
     if view.guess.base is None:
-        albedo = _with_scale({"Albedo": view.guess.albedo}, view.image, f"factor of the BSDF{note}")
+        albedo = _with_scale({"Albedo": result.guess.albedo}, view, f"factor of the BSDF{note}")
     else:
         colours = pictures.to_srgb(view.image(view.guess.base / max(float(view.guess.base.max()), 1e-12)))
-        albedo = f'<div class="maps">{_figure(colours, "Diffuse colours, the brightest is 1")}</div>'
-    table = page.table(("alpha", "eta", "red", "green", "blue"), rows, "Weights of the lobes")
-    return f"<section>\n<h2>Reflectance</h2>\n<figure>{plot}</figure>\n{albedo}\n<h3>Weights</h3>\n{table}\n</section>"
+        colours = _masked(colours, view.data.mask[view.crop])
+        glaze = np.nan_to_num(view.image(view.guess.albedo, np.nan))[..., None].repeat(3, -1)
+        glaze = _masked(pictures.to_srgb(glaze), view.data.mask[view.crop])
+        of_glaze = f"Glaze: on {100 * result.guess.albedo.mean():.0f} % of the surface, which are white"
+        figures = [_figure(colours, "Diffuse colours, the brightest is 1"), _figure(glaze, of_glaze)]
+        albedo = f'<div class="maps">{"".join(figures)}</div>'
+    table = page.table(
+        ("lobe", "roughness (alpha)", "index of refraction", "red", "green", "blue"), rows, "Weights of the lobes"
+    )
+    caption = (
+        "The BSDF times the cosine of the angle θₒ at which light leaves, in the plane of incidence; θₒ is that of the "
+        "mirror direction where it equals the angle of incidence θᵢ."
+    )
+    figure = f"<figure>{plot}<figcaption>{caption}</figcaption></figure>"
+    return f"<section>\n<h2>Reflectance</h2>\n{figure}\n{albedo}\n<h3>Weights</h3>\n{table}\n</section>"
 
 
 def _settings(result: Result, options: Options) -> str:
+    given = dataclasses.asdict(options)
+    given |= {f"descent.{key}": value for key, value in given.pop("descent").items()}
     facts = {
         "images": f"{len(result.data.lights)} of {result.data.mask.shape[1]} x {result.data.mask.shape[0]} pixels",
         "pixels of the mask": str(len(result.data.values)),
-        **{key: str(value) for key, value in dataclasses.asdict(options).items()},
+        **{key: "not given" if value is None else str(value) for key, value in given.items()},
         **output.versions(),
         "processor": processor(),
     }
@@ -300,30 +325,41 @@ def _gain(values: np.ndarray) -> float:
 
 
 def _figure(image: np.ndarray, caption: str) -> str:
-    """image : (H, W, 3), uint8."""
+    """image : (H, W, 3), uint8; or (H, W, 4), where the last one is how opaque it is."""
     text = html.escape(caption)
     return f"<figure>{page.picture(image, caption)}<figcaption>{text}</figcaption></figure>"
 
 
 def _coloured_normals(normals: np.ndarray) -> np.ndarray:
-    return np.nan_to_num((normals + 1) / 2 * 255 + 0.5).astype(np.uint8)
+    colours = np.nan_to_num((normals + 1) / 2 * 255 + 0.5).astype(np.uint8)
+    return _masked(colours, np.isfinite(normals[..., 0]))
 
 
 def _coloured(values: np.ndarray, name: str, low: float | None = None, high: float | None = None) -> np.ndarray:
-    """(H, W, 3), uint8; NaN is black."""
-    low = np.nanmin(values) if low is None else low
-    high = np.nanmax(values) if high is None else high
+    """(H, W, 4), uint8; NaN is transparent."""
+    ends = _ends(values)
+    low, high = ends[0] if low is None else low, ends[1] if high is None else high
     colours = matplotlib.colormaps[name](np.nan_to_num((values - low) / (high - low or 1)), bytes=True)[..., :3]
-    return np.where(np.isfinite(values)[..., None], colours, 0).astype(np.uint8)
+    return _masked(colours, np.isfinite(values))
 
 
-def _with_scale(maps: dict[str, np.ndarray], image: Callable, unit: str) -> str:
-    """Maps of positive numbers, (P,), with one scale. NaN where they are not known."""
+def _ends(values: np.ndarray) -> np.ndarray:
+    """The smallest and the largest, but for NaN."""
+    return np.array([np.nanmin(values), np.nanmax(values)])
+
+
+def _masked(image: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """A picture, (H, W, 3), uint8, that is transparent outside: (H, W, 4)."""
+    return np.concatenate([image, np.where(inside, 255, 0).astype(np.uint8)[..., None]], 2)
+
+
+def _with_scale(maps: dict[str, np.ndarray], view: View, unit: str) -> str:
+    """Maps of positive numbers of the pixels of the result, (P,), with one scale. NaN where they are not known."""
     limit = max(float(np.nanpercentile(np.concatenate(list(maps.values())), 98)), 1e-6)
     figures = []
     for name, values in maps.items():
         caption = f"{name}, mean {number(float(np.nanmean(values)))}"
-        figures.append(_figure(_coloured(image(values, np.nan), "inferno", 0, limit), caption))
+        figures.append(_figure(_coloured(view.image(view.mean(values), np.nan), "inferno", 0, limit), caption))
     return f'<div class="maps">{"".join(figures)}</div>\n{_scale("inferno", 0, limit, unit)}'
 
 

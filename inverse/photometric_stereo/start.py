@@ -89,6 +89,8 @@ def guess(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options)
     for _ in range(3 if options.exposures else 0):
         predicted = least_squares.predicted(solve(values / exposures, directions), directions)
         exposures *= calibration.exposures(values / exposures, predicted, counts, plane.mean_directions())
+    if options.exposures:
+        exposures = calibration.with_trend(exposures, values, counts, directions)
     found = solve((values / exposures).astype(np.float64), directions)
     normals, albedo = least_squares.facing(found), np.linalg.norm(found, axis=1)
     weights = np.zeros((len(lobes), 3))
@@ -110,4 +112,5 @@ def refined(guess: Guess, domain: Domain, data: Dataset, *, before: int, now: in
     at = [centre(rows), centre(columns)]
     fine = [ndimage.map_coordinates(padded[..., i], at, order=1, mode="nearest") for i in range(padded.shape[2])]
     base = None if guess.base is None else np.stack(fine[4:], 1)
-    return replace(guess, normals=unit(np.stack(fine[:3], 1)), albedo=fine[3], base=base)
+    albedo = fine[3] if base is None else np.round(fine[3])  # of a glaze: there is one, or there is none
+    return replace(guess, normals=unit(np.stack(fine[:3], 1)), albedo=albedo, base=base)

@@ -281,7 +281,7 @@ def test_large_results_are_shown_small(folder, tmp_path, monkeypatch):
     options = reconstruction.Options(reflectance=False, resolutions=(1.0,), iterations=(1,), max_depth=2)
     found = reconstruction.reconstruct(dataset.read(folder), options, progress=False)
     monkeypatch.setattr(report, "SHOWN", N // 2)
-    view = report.View.of(found, options)
+    view = report.View.of(found)
     assert view.data.mask.shape == (N // 2, N // 2)
     assert angles(view.guess.normals, view.data.truth).mean() < 1.5 * found.error
     of_depth = normals_of(view.data.image(view.depth, np.nan), view.data.mask)[view.data.mask]

@@ -33,7 +33,7 @@ from rimlight.inverse.photometric_stereo import (
 )
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import Guess
-from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
+from rimlight.inverse.photometric_stereo.evidence import FAR, Judge, Kind, left_out
 from rimlight.inverse.photometric_stereo.rendering import Rendering, unlit
 from rimlight.inverse.photometric_stereo.vectors import unit
 
@@ -166,7 +166,7 @@ def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(found.guess.normals[far[0]], found.start[far[0]], atol=0.01)
     assert min(np.abs(found.guess.normals[far[1]] - n[far[1]]).max() for n in states) < 1e-6
     assert found.taken_back == pytest.approx(0.5, abs=0.1)
-    assert "of the surface is taken back" in output.judgement(found)[-1]
+    assert "of the surface, the normals are those of the start" in output.judgement(found)[-1]
 
 
 def test_a_result_must_win_in_all() -> None:
@@ -180,6 +180,14 @@ def test_a_result_must_win_in_all() -> None:
     assert not state(0.09, 4.0, 3.1).beats(start)
     nothing = state(np.nan, np.nan, np.nan)
     assert not nothing.beats(nothing)
+
+
+def test_a_result_whose_halves_have_nothing_in_common_is_not_taken() -> None:
+    """However much better it is than the start."""
+    state = lambda halves: alternation.State(None, None, Kind(), left_out=0.3, halves=halves, curl=2.0)
+    start = dataclasses.replace(state(26.0), left_out=0.4)
+    assert state(FAR / 2 - 0.1).beats(start)
+    assert not state(FAR / 2 + 0.1).beats(start)
 
 
 def test_other_materials_must_be_clearly_better() -> None:
@@ -307,7 +315,8 @@ def test_colours_are_written_and_shown(matte: Dataset, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "metadata.json").read_text("utf-8"))["materials"] == "several"
     report.write(tmp_path, found, options, title="colours", status="finished")
     text = (tmp_path / "report.html").read_text("utf-8")
-    assert "Diffuse colours" in text and "values that were left out are predicted" in text
+    for said in ("Diffuse colours", "Glaze: on 100 % of the surface", "Values that were left out are predicted"):
+        assert said in text
 
 
 def test_maps_of_a_result(matte: Dataset) -> None:
@@ -356,7 +365,7 @@ def test_few_lights_end_no_worse_than_they_start(K: int) -> None:
     before = angles(begun, data.truth).mean()
     if K == 3:
         np.testing.assert_array_equal(found.guess.normals, begun)
-        assert found.verdict == "not judged" and "the start is kept" in output.judgement(found)[0]
+        assert found.verdict == "not judged" and "The start is kept" in output.judgement(found)[0]
     else:
         assert found.verdict in ("judged", "start") and np.isfinite(found.left_out["result"])
         assert found.error < before + 0.05
