@@ -193,7 +193,8 @@ class ShadingBoundary:
                 turn = dr.rsqrt(r2) * self.silhouettes.preferred(e, use)
                 return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
 
-            number = IN_GLOSS if self.glossy else CANDIDATES if tracer.scatters(2) else 1
+            many = tracer.scatters(2) or tracer.lamps is not None
+            number = IN_GLOSS if self.glossy else CANDIDATES if many else 1
             e, emission = _chosen(candidate, number, choice, emission, scattering, sampler)
             e.density *= dr.select(emission, p_light, 1)
             division = _either(emission, to_lamp, to_surface)

@@ -87,30 +87,32 @@ def test_both_modes(name):
     assert dr.grad(theta)[0] == pytest.approx((w * forward).sum(), abs=1e-4 * np.abs(w * forward).sum())
 
 
-def boundaries(case: cases.Case, first: int, spp: int, terms: tuple[str, ...], kind: str = "bdpt_edge") -> np.ndarray:
-    """Only some terms, (RUNS, H, W, C)."""
+def boundaries(
+    case: cases.Case, first: int, spp: int, terms: tuple[str, ...], kind: str = "bdpt_edge", runs: int = RUNS
+) -> np.ndarray:
+    """Only some terms, (runs, H, W, C)."""
     scene = case.scene()
     motion = Motion(scene, **case.motion)
     it = mi.load_dict({"type": kind, "max_depth": case.max_depth, "sppc": 0})
     it.TERMS = tuple(t for t in it.TERMS if t.name in ("interior", *terms))
-    return np.array([derivative_image(scene, it, motion, spp=spp, seed=first + i) for i in range(RUNS)], np.float64)
+    return np.array([derivative_image(scene, it, motion, spp=spp, seed=first + i) for i in range(runs)], np.float64)
 
 
 def assert_pooled_equal(found: np.ndarray, expected: np.ndarray, least: float) -> None:
     """Quarters of the film differ by noise alone, and their mean by little."""
     h, w = (n // 2 for n in found.shape[1:3])
-    quarters = [a[:, : 2 * h, : 2 * w].reshape(RUNS, 2, h, 2, w, -1).mean((2, 4)) for a in (found, expected)]
-    means, errors = [a.mean(0) for a in quarters], [a.std(0, ddof=1) / np.sqrt(RUNS) for a in quarters]
+    quarters = [a[:, : 2 * h, : 2 * w].reshape(len(a), 2, h, 2, w, -1).mean((2, 4)) for a in (found, expected)]
+    means, errors = [a.mean(0) for a in quarters], [a.std(0, ddof=1) / np.sqrt(len(a)) for a in quarters]
     error = np.hypot(*errors)
     assert (np.abs(means[0] - means[1]) <= 6 * error + 1e-9).all()
     assert error.mean() <= least * np.abs(means[1]).mean()
 
 
 def test_shadows_continued_from_the_light():
-    """A hard shadow on a floor that lights walls: as `prb_edge` has it."""
+    """A hard shadow on a floor that lights walls: as `prb_edge` has it, of which a few runs miss what is rare."""
     indirect = "shadows in indirect light"
     found = boundaries(cases.case("door"), 0, 256, (indirect, f"{indirect}, continued"))
-    assert_pooled_equal(found, boundaries(cases.case("door"), 100, 256, (indirect,), "prb_edge"), 0.1)
+    assert_pooled_equal(found, boundaries(cases.case("door"), 100, 256, (indirect,), "prb_edge", runs=48), 0.1)
     continued = boundaries(cases.case("door"), 0, 16, (f"{indirect}, continued",))
     assert np.abs(continued.mean()) > 0.1 * np.abs(found.mean())
 
