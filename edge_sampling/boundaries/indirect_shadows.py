@@ -108,7 +108,7 @@ class IndirectShadows(ShadowBoundary):
             shadow = fall(scene, light, edge)
             active = shadow.active & point.active & tracer.scatters(point.depth + 1)
             x = shadow.fallen.compute_surface_interaction(shadow.ray, mi.RayFlags.All, active)
-            join = _Join.of(scene, z, x, active, through=self.veils)
+            join = Join.of(scene, z, x, active, through=self.veils)
             if self.veils:
                 join.active &= tracer.scatters(point.depth + 1 + join.veiled.count)
             if self.continues:
@@ -120,7 +120,7 @@ class IndirectShadows(ShadowBoundary):
             far = vicinity.far(join.r2)
         with dr.resume_grad():
             m = material_point(shadow.ray, shadow.fallen, view.active).p
-            held = _held(z.p, m, x.n, join.ω, far, view.active)
+            held = held_point(z.p, m, x.n, join.ω, far, view.active)
             if self.veils:
                 held = _held_by_veil(z.p, m, x.n, join, vicinity, held, view.active)
             return self._value(scene, placement, light, edge, shadow, view, met, m, held, jump, n_dl)
@@ -146,9 +146,9 @@ class IndirectShadows(ShadowBoundary):
             ray = spawn_ray(scene, x, x.to_world(bs.wo))
             pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             z = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            to_z = _Join.of(scene, w, z, active & z.is_valid())
+            to_z = Join.of(scene, w, z, active & z.is_valid())
             z.wavelengths = w.wavelengths
-            join = _Join.of(scene, z, x, to_z.active)
+            join = Join.of(scene, z, x, to_z.active)
             back = density_onwards(x, edge.ω, z, join)
             join.weight *= to_z.weight * (power_heuristic(back, to_z.pdf) / back)
             join.active &= back > 0
@@ -158,12 +158,12 @@ class IndirectShadows(ShadowBoundary):
             far = point.vicinity.around(z.bsdf()).far(join.r2)
         with dr.resume_grad():
             active = view.active
-            p_z = _held(w.p, material_point(ray, pi, active).p, z.n, to_z.ω, far_z, active)
+            p_z = held_point(w.p, material_point(ray, pi, active).p, z.n, to_z.ω, far_z, active)
             m = material_point(shadow.ray, shadow.fallen, active).p
-            held = _held(p_z, m, x.n, join.ω, far, active)
+            held = held_point(p_z, m, x.n, join.ω, far, active)
             return self._value(scene, placement, light, edge, shadow, view, met, m, held, jump, n_dl)
 
-    def _boundary(self, tracer: Tracer, light, edge, shadow, x, z, join: _Join):
+    def _boundary(self, tracer: Tracer, light, edge, shadow, x, z, join: Join):
         """The shadow as z sees it; what the ray to the light meets; the jump; and the normal of the curve, with its
         length element over the density, away from the lit side."""
         near, whole = dr.norm(edge.p - x.p), dr.norm(light.y - x.p)
@@ -252,7 +252,7 @@ class IndirectShadows(ShadowBoundary):
 
 
 @dataclass
-class _Join:
+class Join:
     """What joins a vertex z to the point x beyond it.
 
     ω : unit vector from z to x. r2 : squared distance. pdf : density of x by area, as it is sampled from z.
@@ -276,7 +276,7 @@ class _Join:
         active: mi.Bool,
         *,
         through: bool = False,
-    ) -> _Join:
+    ) -> Join:
         """And let x be seen from there. through : through veils as well?"""
         d = x.p - dr.detach(z.p)
         r2 = dr.squared_norm(d)
@@ -291,12 +291,12 @@ class _Join:
             active &= dr.any(veiled.part != 0)
             weight = f * veiled.part * dr.select(active, cos_over_r2, 0)
             pdf = dr.select(veiled.count > 0, dr.inf, pdf * cos_over_r2)
-            return _Join(ω, r2, pdf, weight, active, veiled)
+            return Join(ω, r2, pdf, weight, active, veiled)
         active &= ~scene.ray_test(ray, active)
-        return _Join(ω, r2, pdf * cos_over_r2, f * dr.select(active, cos_over_r2, 0), active)
+        return Join(ω, r2, pdf * cos_over_r2, f * dr.select(active, cos_over_r2, 0), active)
 
 
-def density_onwards(x: mi.SurfaceInteraction3f, ω: mi.Vector3f, z: mi.SurfaceInteraction3f, join: _Join) -> mi.Float:
+def density_onwards(x: mi.SurfaceInteraction3f, ω: mi.Vector3f, z: mi.SurfaceInteraction3f, join: Join) -> mi.Float:
     """Density by area with which z is found from x, where light arrives in the direction ω."""
     lit = mi.SurfaceInteraction3f(x)
     lit.wi = x.to_local(-ω)
@@ -304,7 +304,9 @@ def density_onwards(x: mi.SurfaceInteraction3f, ω: mi.Vector3f, z: mi.SurfaceIn
     return dr.detach(pdf * dr.abs_dot(z.n, join.ω) / join.r2)
 
 
-def _held(z: mi.Point3f, m: mi.Point3f, n: mi.Vector3f, ω: mi.Vector3f, far: mi.Float, active: mi.Bool) -> mi.Point3f:
+def held_point(
+    z: mi.Point3f, m: mi.Point3f, n: mi.Vector3f, ω: mi.Vector3f, far: mi.Float, active: mi.Bool
+) -> mi.Point3f:
     """The point that is held as z sees it: the material point m, or close to z the one in the direction ω, on the
     plane with the normal n."""
     slid = z + ω * (dr.dot(m - z, n) / dr.select(active, dr.dot(ω, n), 1))
@@ -315,17 +317,17 @@ def _held_by_veil(
     z: mi.Point3f,
     m: mi.Point3f,
     n: mi.Vector3f,
-    join: _Join,
+    join: Join,
     vicinity: Vicinity,
     held: mi.Point3f,
     active: mi.Bool,
 ) -> mi.Point3f:
-    """`_held`, but where a veil is before the point: the point that z sees through what is held on the veil."""
+    """`held_point`, but where a veil is before the point: the point that z sees through what is held on the veil."""
     veiled = join.veiled
     active = active & (veiled.count > 0)
     on_veil = material_point(veiled.ray, veiled.first, active)
     far = vicinity.far(dr.square(veiled.first.t))
-    d = _held(z, on_veil.p, dr.detach(on_veil.n), join.ω, far, active) - z
+    d = held_point(z, on_veil.p, dr.detach(on_veil.n), join.ω, far, active) - z
     seen = z + d * (dr.dot(m - z, n) / dr.select(active, dr.dot(d, n), 1))
     return dr.select(active, seen, held)
 

@@ -18,14 +18,13 @@ finds the shadows of small lights, is divided as between the sampling of lights 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
-from rimlight.edge_sampling.choice.sampling import EdgeSample, Reservoir, power_heuristic
+from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Cone, Lobe, View
 from rimlight.edge_sampling.divided_light import division_of
@@ -34,6 +33,8 @@ from rimlight.edge_sampling.parametrisation import Division, Vicinity, in_plane,
 from rimlight.edge_sampling.rays import spawn_ray
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
+from .either_light import chosen_edge, either
+from .from_edges import FromEdge, FromEdges
 from .indirect_shadows import is_bent, share
 from .lune import Lune, spreads
 from .near_lamps import share_at_first
@@ -43,10 +44,6 @@ from .veils import has_veils, is_veil
 
 #: Directions that are sampled from a BSDF, to find its peak.
 DIRECTIONS = 8
-
-#: Where both kinds of light may come past edges: how much brighter emitted light is taken to be than scattered light,
-#: and the least part of the samples of each kind.
-EMISSION, LEAST = 16, 0.1
 
 #: How much to prefer edges that stand still, for scattered light at points that stand still: they count only where what
 #: is seen past them moves.
@@ -73,7 +70,7 @@ class ShadingBoundary:
     """
 
     _NUMBERS = ("transmits", "glossy", "smooth", "soft", "veils", "emission", "emission_at_first", "several")
-    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps")
+    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps", "from_edges")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None):
@@ -81,6 +78,8 @@ class ShadingBoundary:
         self.geometry = geometry = silhouettes.geometry
         self.moving_shapes = None if moving is None else [pointer(s) for s in moving]
         self.boxes = EmitterBoxes(scene, geometry)
+        #: What finds points from edges; None: nothing does.
+        self.from_edges = FromEdges.of(silhouettes)
         self.smooth_lamps = SmoothLamps(scene)
         lamps = [e.get_shape() for e in scene.emitters() if e.flags() & mi.EmitterFlags.Surface]
         self.bent_lamps = [mi.ShapePtr(s) for s in lamps if is_bent(s)]
@@ -132,12 +131,27 @@ class ShadingBoundary:
         -------
         mi.Spectrum, (N,): zero, with the gradient of the reflected radiance.
         """
+        near = self._near(tracer, placement, point, sampler)
+        point = point if near is None else near.point
+        with dr.suspend_grad():
+            e, emission, light, active, to_lamp = self._edge(tracer, placement, point, sampler, choice)
+            if near is not None:
+                e, emission = dr.select(near.found, near.sample, e), emission & ~near.found
+                part = near.part(placement, e, emission)
+            division = either(emission, to_lamp, Division(point.vicinity.around(point.si.bsdf())))
+        L = self._evaluate(tracer, placement, point, e, sampler, active, light, emission, division)
+        with dr.resume_grad():
+            return L if near is None else L * part
+
+    def _edge(
+        self, tracer: Tracer, placement: Placement, point: ShadingPoint, sampler: mi.Sampler, choice: mi.Float
+    ) -> tuple[EdgeSample, mi.Bool, mi.EmitterPtr, mi.Bool, Division]:
+        """An edge for each point; is it for emitted light, that of which light, is there one, and how is that light
+        divided?"""
         scene, si = tracer.scene, point.si
         with dr.suspend_grad():
             bsdf = si.bsdf()
-            moves = mi.Bool(self.moving_shapes is None)
-            for shape in self.moving_shapes or ():
-                moves |= is_met(si, shape)
+            moves = self._moves(si)
             active = point.active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
             # ---------------------- Emitted light, or scattered ----------------------
@@ -167,7 +181,7 @@ class ShadingBoundary:
                 """An edge for emitted light, which is sought in the directions of one light; or for scattered light,
                 which is sought everywhere, and where both sides of edges close by count. And about what it contributes
                 if nothing hides it."""
-                division = _either(emitted, to_lamp, to_surface)
+                division = either(emitted, to_lamp, to_surface)
                 # Of the edges whose faces are both seen, emitted light counts only those on the borders of lamps, which
                 # the tree takes for open ones.
                 radius = dr.select(emitted, 0, dr.inf if self.veils else division.vicinity.radius)
@@ -195,10 +209,22 @@ class ShadingBoundary:
 
             many = tracer.scatters(2) or tracer.lamps is not None
             number = IN_GLOSS if self.glossy else CANDIDATES if many else 1
-            e, emission = _chosen(candidate, number, choice, emission, scattering, sampler)
+            e, emission = chosen_edge(candidate, number, choice, emission, scattering, sampler)
             e.density *= dr.select(emission, p_light, 1)
-            division = _either(emission, to_lamp, to_surface)
-        return self._evaluate(tracer, placement, point, e, sampler, active, light, emission, division)
+            return e, emission, light, active, to_lamp
+
+    def _near(self, tracer: Tracer, placement: Placement, point: ShadingPoint, sampler: mi.Sampler) -> FromEdge | None:
+        """Points of which some are found from edges; None: this is not done."""
+        if self.from_edges is None or not tracer.scatters(3):
+            return None
+        return self.from_edges.replaced(tracer, placement, point, sampler)
+
+    def _moves(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Do edges matter there that stand still?"""
+        moves = mi.Bool(self.moving_shapes is None)
+        for shape in self.moving_shapes or ():
+            moves |= is_met(si, shape)
+        return moves
 
     @staticmethod
     def _lobe(si, bsdf, sampler, active) -> Lobe:
@@ -407,45 +433,3 @@ def _found_from_points(
     cos_z, cos_x, cos_y = dr.abs_dot(si.n, si.to_world(si.wi)), dr.abs_dot(si.n, ω), dr.abs_dot(y.n, y.to_world(y.wi))
     found = density_from_points(point.density, cos_z, cos_x, cos_y, r_x, r_y)
     return dr.select(active & (point.depth > 1), found, dr.inf)
-
-
-def _either(emitted: mi.Bool, to_lamp: Division, to_surface: Division) -> Division:
-    """How the light is divided that lamps emit, or that surfaces scatter."""
-    radius, turning = dr.select(emitted, to_lamp.vicinity.radius, to_surface.vicinity.radius), to_lamp.turning
-    return Division(Vicinity(radius), turning and replace(turning, size=dr.select(emitted, turning.size, 0)))
-
-
-def _chosen(
-    candidate: Callable, number: int, choice: mi.Float, emission: mi.Bool, scattering: mi.Bool, sampler: mi.Sampler
-) -> tuple[EdgeSample, mi.Bool]:
-    """Of a number of candidates one: for emitted light, or for scattered light. If there are both, a reservoir of each
-    takes half of the candidates, and one of the two is kept. And is it for emitted light?
-
-    candidate : makes one, given a uniform number, the kind of light, and a mask. number : even, but for one kind alone.
-    choice : uniform in [0, 1); the
-    numbers of each kind are stratified by it.
-    """
-    active, half = emission | scattering, number // 2
-    both = emission & scattering
-    count = dr.select(both, mi.Float(half), number)
-
-    def look(k, emitted, scattered, sampler):
-        is_emitted = emission & (~scattering | (k < half))
-        e, target = candidate((choice + dr.select(both, k % half, k)) / count, is_emitted, active, sampler)
-        fuller, _ = dr.select(is_emitted, emitted, scattered).take(e, target, sampler, active)
-        return k + 1, dr.select(is_emitted, fuller, emitted), dr.select(is_emitted, scattered, fuller), sampler
-
-    width = dr.width(active)
-    _, emitted, scattered, _ = dr.while_loop(
-        (dr.zeros(mi.UInt32, width), dr.zeros(Reservoir, width), dr.zeros(Reservoir, width), sampler),
-        lambda k, *_: active & (k < number),
-        look,
-        label="candidates",
-    )
-    brightness = EMISSION * emitted.total
-    p = dr.clip(brightness / (brightness + scattered.total), LEAST, 1 - LEAST)
-    p = dr.select(emitted.total > 0, dr.select(scattered.total > 0, p, 1), 0)
-    for_emission = sampler.next_1d(active) < p
-    e = dr.select(for_emission, emitted, scattered).kept(count)
-    e.density *= dr.select(for_emission, p, 1 - p)
-    return e, for_emission

@@ -138,6 +138,12 @@ class Silhouettes:
         return self.count + (len(self.curves) if self.curves is not None else 0)
 
     @property
+    def moving_edges(self) -> np.ndarray:
+        """Numbers of the edges that move, (M,), uint32, but for those in which shapes cut through each other."""
+        still = np.array(self._still)[: self._first_line[0]]
+        return np.flatnonzero(~still).astype(np.uint32)
+
+    @property
     def leaves(self) -> int:
         """Number of leaves of the trees over the edges."""
         return self.tree.leaf_offsets[-1] if self.tree is not None else 0
@@ -232,6 +238,11 @@ class Silhouettes:
             return mi.Float(1)
         still = (sample.edge < self.count) & dr.gather(mi.Bool, self._still, dr.minimum(sample.edge, self.count - 1))
         return dr.select(still, use[1], use[0])
+
+    def is_moving_edge(self, sample: EdgeSample) -> mi.Bool:
+        """Is it on one of `moving_edges`?"""
+        on_edge = sample.edge < self._first_line
+        return on_edge & ~dr.gather(mi.Bool, self._still, dr.select(on_edge, sample.edge, 0))
 
     def only_bends(self, sample: EdgeSample, outline: OutlinePoint) -> mi.Bool:
         """Is it on an edge across which nothing differs but the planes of two smooth-shaded faces?"""
