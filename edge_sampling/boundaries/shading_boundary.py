@@ -52,10 +52,10 @@ STILL = 0.2
 #: How much to prefer edges whose faces are both seen, where surfaces that let rays through may be before them.
 VEILED = 0.2
 
-#: Edges from which one is kept, in proportion to what it contributes if nothing hides it: where surfaces are matt, and
-#: where any is glossy, since the choice then depends on the direction. The more there are, the less is left of the
-#: stratification of a single one.
-CANDIDATES, IN_GLOSS = 2, 4
+#: Edges from which one is kept, in proportion to what it contributes if nothing hides it: where surfaces are matt; and
+#: where any is glossy, or lets rays through, since much depends on the direction then. The more there are, the less is
+#: left of the stratification of a single one.
+CANDIDATES, MORE = 2, 4
 
 
 class ShadingBoundary:
@@ -208,7 +208,7 @@ class ShadingBoundary:
                 return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
 
             many = tracer.scatters(2) or tracer.lamps is not None
-            number = IN_GLOSS if self.glossy else CANDIDATES if many else 1
+            number = MORE if self.glossy or self.veils else CANDIDATES if many else 1
             e, emission = chosen_edge(candidate, number, choice, emission, scattering, sampler)
             e.density *= dr.select(emission, p_light, 1)
             return e, emission, light, active, to_lamp

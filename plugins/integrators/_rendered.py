@@ -57,8 +57,8 @@ def _state(scene: mi.Scene, sensor: mi.Sensor) -> list[Any]:
 
 def _number(value: Any) -> Any:
     value = getattr(value, "matrix", value)
-    if dr.is_tensor_v(value):
+    if value is not None and dr.is_tensor_v(value):
         return value.array.index
-    if not dr.is_array_v(value):
+    if value is None or not dr.is_array_v(value):
         return value if isinstance(value, int | float | str) else None
     return value.index if dr.is_jit_v(value) and dr.depth_v(value) == 1 else [_number(v) for v in value]
