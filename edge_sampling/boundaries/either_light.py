@@ -11,9 +11,8 @@ import mitsuba as mi
 from rimlight.edge_sampling.choice.sampling import EdgeSample, Reservoir
 from rimlight.edge_sampling.parametrisation import Division, Vicinity
 
-#: Where both kinds of light may come past edges: how much brighter emitted light is taken to be than scattered light,
-#: and the least part of the samples of each kind.
-EMISSION, LEAST = 16, 0.1
+#: Part of the samples that are for emitted light, where both kinds of light may come past an edge.
+EMISSION = 2 / 3
 
 
 def either(emitted: mi.Bool, to_lamp: Division, to_surface: Division) -> Division:
@@ -49,9 +48,8 @@ def chosen_edge(
         look,
         label="candidates",
     )
-    brightness = EMISSION * emitted.total
-    p = dr.clip(brightness / (brightness + scattered.total), LEAST, 1 - LEAST)
-    p = dr.select(emitted.total > 0, dr.select(scattered.total > 0, p, 1), 0)
+    p = dr.select(scattered.total > 0, EMISSION, mi.Float(1))
+    p = dr.select(emitted.total > 0, p, 0)
     for_emission = sampler.next_1d(active) < p
     e = dr.select(for_emission, emitted, scattered).kept(count)
     e.density *= dr.select(for_emission, p, 1 - p)
