@@ -113,6 +113,7 @@ test_convergence.py::test_error_falls_with_samples[room_camera]
 test_convergence.py::test_error_falls_with_samples[room_light]
 test_convergence.py::test_error_falls_with_samples[smooth_torus_sun]
 test_balance.py::test_derivatives_stay_the_same[open_air
+test_from_edges.py::test_edges_find_what_paths_find[on a tray
 test_balanced_fits.py::test_integrators_of_interreflections_divide
 test_convergence.py::test_error_falls_with_samples[sphere_soft]
 test_convergence.py::test_error_falls_with_samples[thin_lens_camera]

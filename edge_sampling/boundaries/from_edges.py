@@ -117,10 +117,9 @@ class FromEdges:
         with dr.resume_grad():
             m = material_point(ray, pi, active)
             x.p = dr.replace_grad(x.p, held_point(z.p, m.p, dr.detach(x.n), join.ω, far, active))
-            x.n = dr.replace_grad(x.n, m.n)
             si = dr.select(found, x, z)
         depth = dr.select(found, point.depth + 1, point.depth)
         density = dr.select(found, join.pdf, point.density)
         active = dr.select(found, active, point.active)
-        moved = replace(point, si=si, depth=depth, active=active, slides=point.slides | found, density=density)
+        moved = replace(point, si=si, depth=depth, active=active, density=density)
         return FromEdge(self, moved, found, sample, dr.select(found, weight, 1))

@@ -78,8 +78,8 @@ class ShadingBoundary:
         self.geometry = geometry = silhouettes.geometry
         self.moving_shapes = None if moving is None else [pointer(s) for s in moving]
         self.boxes = EmitterBoxes(scene, geometry)
-        #: What finds points from edges; None: nothing does.
-        self.from_edges = FromEdges.of(silhouettes)
+        #: What finds points from edges of shapes that move; None: nothing does.
+        self.from_edges = FromEdges.of(silhouettes) if moving is not None else None
         self.smooth_lamps = SmoothLamps(scene)
         lamps = [e.get_shape() for e in scene.emitters() if e.flags() & mi.EmitterFlags.Surface]
         self.bent_lamps = [mi.ShapePtr(s) for s in lamps if is_bent(s)]

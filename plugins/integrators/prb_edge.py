@@ -52,8 +52,9 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     direction is held: so contacts and corners have a finite variance, but for a logarithm. In backward mode, paths are
     written down, 76 bytes for each vertex and sample, and visited again from their end.
 
-    **Boundaries at shading points.** Each path keeps *one* of its vertices, chosen by a reservoir in proportion to
-    throughput, and one edge as seen from there. What is seen past the edge is traced to ``max_depth``. Shadows, hard
+    **Boundaries at shading points.** Each path keeps *one* of its vertices for each kind of boundary, chosen by a
+    reservoir in proportion to throughput, and one edge as seen from there. Where edges that move are close to other
+    surfaces, some points are found from them. What is seen past the edge is traced to ``max_depth``. Shadows, hard
     ones too, are found from the lights, on what the camera sees, and on what lights that.
 
     **Memory.** As with ``direct_edge``, many samples are taken in passes.

@@ -66,6 +66,8 @@ def walked(job: Job) -> tuple[mi.Sampler, Walk | Vertex]:
     sampler of their rays, in the state in which `Job.sample_rays` is to have it, and the paths."""
     spp = job.counts.shading
     if spp not in job.walks:
+        # Those with another number of samples are not needed again, as a rule, and large.
+        job.walks.clear()
         beyond = {t.beyond for t in job.terms if isinstance(t, FromPoints) and t.boundary(job)}
         sampler, _ = over_film(job.sensor, seed_of("paths", job.seed), spp)
         of_rays = sampler.clone()

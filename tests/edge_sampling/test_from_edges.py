@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from building import CUBE_FACES, cube_vertices, diffuse, mesh
 
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling.boundaries import from_edges
@@ -59,7 +60,28 @@ def test_not_of_many_edges(monkeypatch):
     assert FromEdges.of(silhouettes) is None
 
 
-def test_edges_find_what_paths_find(monkeypatch):
+def lifted_box() -> mi.Scene:
+    """The small box of the Cornell box, well above the floor."""
+    scene = cases.cornell_box()
+    params = mi.traverse(scene)
+    p = params["small-box.vertex_positions"]
+    params["small-box.vertex_positions"] = dr.ravel(dr.unravel(mi.Point3f, p) + mi.Point3f(0, 0.2, 0))
+    params.update()
+    return scene
+
+
+def box_on_tray() -> mi.Scene:
+    """In its place a box above a plate, in one mesh: what moves lights what moves with it."""
+    plate = np.array([[x, -0.8, z] for x in (-0.3, 0.9) for z in (-0.3, 0.9)])
+    vertices = np.concatenate([0.2 * cube_vertices() + [0.3, -0.35, 0.3], plate])
+    faces = [*CUBE_FACES, [8, 9, 10], [9, 11, 10]]
+    box = mi.cornell_box()
+    box["small-box"] = mesh("small-box", vertices, faces, bsdf=diffuse(0.7, two_sided=True))
+    return mi.load_dict({**box, "sensor": {**box["sensor"], "film": cases.film()}}, optimize=False)
+
+
+@pytest.mark.parametrize(("make", "runs"), [(lifted_box, 30), (box_on_tray, 200)], ids=["lifted", "on a tray"])
+def test_edges_find_what_paths_find(make, runs, monkeypatch):
     """What both ways find, from edges alone and from paths alone: the same mean over quarters of the film."""
     part = FromEdge.part
 
@@ -68,20 +90,15 @@ def test_edges_find_what_paths_find(monkeypatch):
 
     monkeypatch.setattr(FromEdge, "part", shared)
     monkeypatch.setattr(from_edges, "PART", 0.5)
-    case = cases.case("cornell_box")
-    scene = case.scene()
-    params = mi.traverse(scene)
-    key = case.motion["key"]
-    params[key] = dr.ravel(dr.unravel(mi.Point3f, params[key]) + mi.Point3f(0, 0.2, 0))
-    params.update()
-    motion = Motion(scene, **case.motion)
+    scene = make()
+    motion = Motion(scene, **cases.case("cornell_box").motion)
     images = []
     for share in (0, 1):
         monkeypatch.setattr(FromEdge, "share", lambda *_, share=share: mi.Float(share))
         integrator = mi.load_dict({"type": "prb_edge", "max_depth": 4, "sppc": 0})
         integrator.TERMS = tuple(t for t in TERMS if t.name in ("interior", "edges from points"))
-        runs = [derivative_image(scene, integrator, motion, spp=128, seed=i + 100 * share) for i in range(16)]
-        images.append(np.array(runs, np.float64).reshape(16, 2, 16, 2, 16, 3).mean((2, 4, 5)))
-    (a, b), errors = (i.mean(0) for i in images), [i.std(0, ddof=1) / 4 for i in images]
+        made = [derivative_image(scene, integrator, motion, spp=128, seed=i + 1000 * share) for i in range(runs)]
+        images.append(np.array(made, np.float64).reshape(runs, 2, 16, 2, 16, 3).mean((2, 4, 5)))
+    (a, b), errors = (i.mean(0) for i in images), [i.std(0, ddof=1) / runs**0.5 for i in images]
     assert (np.abs(a - b) <= 4 * np.hypot(*errors)).all()
     assert np.hypot(*errors).mean() < 0.15 * np.abs(b).mean()
