@@ -279,6 +279,11 @@ def paint(axes: Axes) -> None:
         label.set(color=INK, fontsize=8.5)
     for side, spine in axes.spines.items():
         spine.set(color=INK, linewidth=0.6, visible=side in ("left", "bottom"))
+    low, high = axes.get_ylim()
+    if axes.get_yscale() == "log" and high < 10 * low:
+        # Within a decade, powers of ten are hard to read.
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
 
 
 def svg(figure: Figure, text: str) -> str:
