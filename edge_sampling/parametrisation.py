@@ -95,7 +95,8 @@ def sliding_point(
     point, the rest that of the point where the ray meets the surface."""
     si = surface_met(scene, dr.detach(ray), pi, FOLLOWS, active)
     slides = active & (dr.detach(held) < 1)
-    slides &= ~grazes(si, ray.d, slides)
+    # A ray from its own plane meets it anywhere, as far as rounding can tell, and would slide arbitrarily fast.
+    slides &= ~grazes(si, ray.d, slides) & ~in_plane(si, dr.detach(ray.o))
     slid = surface_met(scene, ray, pi, mi.RayFlags.All, slides)
 
     def blend(a, b):

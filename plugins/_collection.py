@@ -6,6 +6,9 @@ lie in reference cycles, so that nothing but the collector frees them:
 * A kernel holds the same virtual function twice, traced while several objects of its class were registered, and traced
   while there was one. See `docs/troubleshooting.md`.
 * A scene is freed while `dr.freeze` records a function.
+
+In a third situation, which the same guard prevents, NVIDIA's assembler refuses a program, and Dr.Jit ends the process:
+where a large kernel with function calls keeps what finds no register in shared memory (Dr.Jit 1.5 asks for that).
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from __future__ import annotations
 import gc
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import drjit as dr
 import mitsuba as mi
@@ -81,6 +84,10 @@ class _Collector:
 _collector = _Collector()
 
 
+def _on_gpu() -> bool:
+    return (mi.variant() or "").startswith("cuda")
+
+
 @contextmanager
 def no_collection() -> Iterator[None]:
     """Keep Python's garbage collector from running. What is traced in here is also evaluated in here.
@@ -107,8 +114,9 @@ def no_collection() -> Iterator[None]:
     raised = True
     try:
         _evaluate()
-        yield
-        _evaluate()
+        with dr.scoped_set_flag(dr.JitFlag.SpillToSharedMemory, False) if _on_gpu() else nullcontext():
+            yield
+            _evaluate()
         raised = False
     finally:
         _collector.on(raised)

@@ -224,13 +224,13 @@ def checkered_ball() -> mi.Scene:
 
 
 def mapped(kind: str, seed: int = 1, **texture: Any) -> dict:
-    """Normals that lean by up to 30 degrees, or as steep heights."""
+    """Normals that lean by up to 30 degrees, or as steep heights. A GPU would interpolate them in steps."""
     rng = np.random.default_rng(seed)
     data = rng.uniform(0, 0.45, (6, 6, 1))
     if kind == "normalmap":
         data = np.concatenate([rng.uniform(-0.4, 0.4, (5, 7, 2)), np.ones((5, 7, 1))], 2)
         data = 0.5 + 0.5 * data / np.linalg.norm(data, axis=2, keepdims=True)
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(data.astype(np.float32)), "raw": True, **texture}
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(data.astype(np.float32)), "raw": True, "accel": False, **texture}
     return {"type": kind, "normalmap": texture, "nested": diffuse(0.8, 0.5, 0.3)}
 
 

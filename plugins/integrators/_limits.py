@@ -229,14 +229,15 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
             f"the derivative lacks, in the light that {', '.join(slid)} throw on other surfaces, the jumps of their "
             "textures, whose coordinates change; use bilinear bitmaps."
         )
-    stepped = maps_in_steps(moving.with_lines)
+    mirrors = [s for s in surfaces(scene) if is_mirror(s)] if depths.scatters(1) else []
+    stepped = maps_in_steps([*moving.with_lines, *(mirrors if moving.anything else ())])
     if stepped:
         limits.append(
-            f"the derivative is off where the normals of maps turn away, since this GPU interpolates the bitmaps "
-            f'{", ".join(stepped)} in {round(1 / TEXTURE_UNIT_STEP)} steps; set their property "accel" to false.'
+            "the derivative is off where the normals of maps turn away, and in what mirrors and glass with maps show, "
+            f"since this GPU interpolates the bitmaps {', '.join(stepped)} in {round(1 / TEXTURE_UNIT_STEP)} steps; "
+            'set their property "accel" to false.'
         )
-    shown = depths.scatters(1) and any(is_mirror(s) for s in surfaces(scene))
-    slides = moving.camera or moving.lights or (shown and moving.anything)
+    slides = moving.camera or moving.lights or (mirrors and moving.anything)
     if slides and any(e.class_name() == "SunskyEmitter" for e in scene.emitters()):
         limits.append(
             "the derivative lacks the motion of the border of the sun; set the sun_scale of sunsky to 0, and add a "

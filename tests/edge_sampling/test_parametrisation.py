@@ -13,8 +13,8 @@ from rimlight.edge_sampling.parametrisation import look_from, sliding_point
 #: Distance of the scene from the origin, where a unit in the last place is 0.002.
 FAR = 30_000.0
 
-#: Distances between two vertices: from twenty such units on.
-DISTANCES = np.geomspace(0.04, 400, 64)
+#: Distances between two vertices: from thirty such units on. What is closer to a plane than 16 is taken to be in it.
+DISTANCES = np.geomspace(0.06, 400, 64)
 
 
 def turn(move, held=0.0):
@@ -59,3 +59,21 @@ def test_what_moves_across_the_ray_turns(across):
     moves = lambda θ, x, params: x + mi.Vector3f(across) * θ
     assert np.abs(turn(moves)).max() < 1e-4
     assert np.abs(turn(moves, held=1.0).T - across).max() < 1e-4
+
+
+@pytest.mark.parametrize(("units", "slides"), [(8, False), (32, True)])
+def test_rays_from_a_plane_do_not_slide_over_it(units, slides):
+    """The point where a ray meets a floor slides by the height over it through the cosine. Both are rounding, where the
+    ray starts in the floor's own plane: in the corner of a room, say, whose camera moves."""
+    there = scene(floor=horizontal((0, 0, 0), 1, "floor", bsdf=diffuse(0.5)))
+    height, θ = units * dr.epsilon(mi.Float), mi.Float(0)
+    dr.enable_grad(θ)
+    dr.set_grad(θ, 1)
+    d = dr.normalize(mi.Vector3f(0.3, -height, 0))
+    ray = mi.Ray3f(mi.Point3f(-0.9, height, 0), d)
+    pi = there.ray_intersect_preliminary(ray)
+    assert dr.all(pi.is_valid())
+    ray.o = ray.o + mi.Vector3f(0, θ, 0)
+    p = sliding_point(there, ray, pi, mi.Float(0), mi.Bool(True)).p
+    speed = np.array(dr.forward_to(p)).ravel()
+    assert np.allclose(speed, [slides * 0.3 / height, 0, 0], rtol=1e-3)

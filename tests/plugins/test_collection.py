@@ -137,6 +137,17 @@ def test_within_a_recorded_loop():
     assert np.all(np.array(dr.while_loop((dr.opaque(mi.UInt32, 0, 3),), lambda i: i < 5, body)[0]) == 5)
 
 
+@pytest.mark.parametrize(("variant", "stays"), [("cuda_ad_rgb", False), ("llvm_ad_rgb", True), (None, True)])
+def test_no_program_for_a_gpu_spills_to_shared_memory(monkeypatch, variant, stays):
+    """NVIDIA's assembler refuses that in programs with function calls, and Dr.Jit ends the process."""
+    spills = lambda: dr.flag(dr.JitFlag.SpillToSharedMemory)
+    assert spills()
+    monkeypatch.setattr(mi, "variant", lambda: variant)
+    with rimlight.no_collection():
+        assert spills() == stays
+    assert spills()
+
+
 def test_costs_microseconds():
     """The collection that it replaces takes tens of milliseconds."""
     import timeit

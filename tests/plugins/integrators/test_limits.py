@@ -83,24 +83,48 @@ def test_far_plane_of_each_sensor():
 # ---------------------- Maps on a GPU ----------------------
 
 
-@pytest.mark.parametrize(("kind", "name"), [("bumpmap", "heights"), ("normalmap", "normalmap")])
-@pytest.mark.parametrize("steps", [False, True])
-def test_maps_that_are_interpolated_in_steps(monkeypatch, kind, name, steps):
-    """As the texture units of a GPU do it: places are rounded to 1/256 of a texel."""
+@pytest.fixture
+def in_steps(monkeypatch):
+    """Bitmaps are looked up as the texture units of a GPU do it: places are rounded to 1/256 of a texel."""
     exact = texture_lines._value
 
     def rounded(texture, at):
         size = np.array(texture.resolution(), float)
         return exact(texture, mi.Point2f(*(dr.round(x * n * 256) / (n * 256) for x, n in zip(at, size, strict=True))))
 
-    if steps:
-        monkeypatch.setattr(texture_lines, "_value", rounded)
+    monkeypatch.setattr(texture_lines, "_value", rounded)
+
+
+def mapped_board(kind: str, name: str, inner: dict):
     texels = np.random.default_rng(0).uniform(0.4, 0.6, (5, 7, 3)).astype(np.float32)
-    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
-    board = cases.horizontal((0, 0, 0), 1, "board", bsdf={"type": kind, name: bitmap, "inner": cases.diffuse(0.5)})
-    scene = cases.scene(sensor=cases.camera((0, 3, -3), (0, 0, 0)), board=board, sky=cases.constant())
-    said_so = ["in 256 steps" in m and '"accel"' in m for m in said(scene, "board.vertex_positions")]
-    assert sum(said_so) == steps
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "accel": False}
+    board = cases.horizontal((0, 0, 0), 1, "board", bsdf={"type": kind, name: bitmap, "inner": inner})
+    cube = {"type": "cube", "id": "cube", "to_world": mi.ScalarTransform4f().translate([0, 1, 0]).scale(0.2)}
+    return cases.scene(sensor=cases.camera((0, 3, -3), (0, 0, 0)), board=board, cube=cube, sky=cases.constant())
+
+
+MAPS = pytest.mark.parametrize(("kind", "name"), [("bumpmap", "heights"), ("normalmap", "normalmap")])
+MATT, MIRROR = {"type": "diffuse"}, {"type": "conductor"}
+
+
+def warns_of_steps(scene, key: str) -> int:
+    return sum("in 256 steps" in m and '"accel"' in m for m in said(scene, key))
+
+
+@MAPS
+@pytest.mark.parametrize(("inner", "key"), [(MATT, "board"), (MIRROR, "cube")], ids=["turns_away", "mirrors"])
+def test_maps_that_are_interpolated_in_steps(in_steps, kind, name, inner, key):
+    assert warns_of_steps(mapped_board(kind, name, inner), f"{key}.vertex_positions") == 1
+
+
+@MAPS
+def test_maps_without_steps(kind, name):
+    assert warns_of_steps(mapped_board(kind, name, MATT), "board.vertex_positions") == 0
+
+
+@MAPS
+def test_steps_of_a_matt_map_that_stays_do_not_matter(in_steps, kind, name):
+    assert warns_of_steps(mapped_board(kind, name, MATT), "cube.vertex_positions") == 0
 
 
 @pytest.mark.parametrize("filter_type", ["nearest", "bilinear"])
