@@ -125,7 +125,7 @@ class Silhouettes:
         moves = np.ones(len(edges), bool)
         if moving is not None:
             moves = edges.is_line | np.array(moving, bool)[edges.mesh].any(axis=1)
-        self._still = mi.Bool(~moves)
+        self._still = mi.Bool(~moves if len(moves) else [True])  # Dr.Jit 1.5 cannot freeze empty arrays
         groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         #: Number of groups of edges.
         self.groups = len(groups)

@@ -73,6 +73,21 @@ def test_replay_sees_new_values(kind, scene, key):
     assert_frozen_is_unfrozen(scene, integrator, key)
 
 
+def balls(light):
+    """There is no mesh, so that no list of edges has anything in it. (Dr.Jit ends the process at an empty one.)"""
+    ball = {"type": "sphere", "id": "ball", "radius": 0.7, "bsdf": cases.diffuse(0.5)}
+    floor = {"type": "sphere", "center": [0, -4, 0], "radius": 3.0, "bsdf": cases.diffuse(0.5)}
+    return cases.scene(sensor=cases.camera((0, 1, -4), (0, 0, 0)), ball=ball, floor=floor, light=light)
+
+
+@pytest.mark.parametrize("key", ["ball.to_world", "sensor.to_world", "light.position"])
+@pytest.mark.parametrize("kind", ["direct_edge", "prb_edge", "bdpt_edge"])
+def test_without_meshes(kind, key):
+    point = {"type": "point", "position": [2, 3, -1], "intensity": 9.0}
+    scene = balls(point if "light" in key else cases.constant())
+    assert_frozen_is_unfrozen(scene, mi.load_dict({"type": kind}), key)
+
+
 @pytest.mark.parametrize("seed", [941643, 941650, 941656, 941662])
 def test_random_scenes(seed):
     """Of sensors, Mitsuba 3.9 freezes `perspective` alone: seeds were taken that have one."""
