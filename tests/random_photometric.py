@@ -262,9 +262,9 @@ def run(seed: int) -> Row:
         mean = lambda normals: float(angles(normals, data.truth)[known].mean())
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            counts = start.counts(data, data, 1.0, options.dark)
+            counts, method = start.counts(data, data, 1.0, options.dark), start.method(data, data, 1.0, options)
             lobes = ggx.read_dictionary()[0]
-            row.before = mean(start.guess(data, lobes, counts, options).normals)
+            row.before = mean(start.guess(data, lobes, counts, options, method).normals)
             found = ps.reconstruct(data, options, progress=False)
         row.after, row.verdict = mean(found.guess.normals), found.verdict
         row.left_out, row.halves, row.curl, row.taken_back = found.left_out, found.halves, found.curl, found.taken_back
@@ -284,11 +284,13 @@ def exposures(seed: int) -> tuple[float, float] | None:
         return None
     data, options, row = make(seed)
     data = plausibility.checked(data)
-    counts, lobes = start.counts(data, data, 1.0, options.dark), ggx.read_dictionary()[0]
+    counts, method = start.counts(data, data, 1.0, options.dark), start.method(data, data, 1.0, options)
+    lobes = ggx.read_dictionary()[0]
     known, errors, with_trend = np.linalg.norm(data.truth, axis=1) > 0.5, [], calibration.with_trend
     for given_back in (lambda found, *_: found, with_trend):
         calibration.with_trend = given_back
-        errors.append(float(angles(start.guess(data, lobes, counts, options).normals, data.truth)[known].mean()))
+        normals = start.guess(data, lobes, counts, options, method).normals
+        errors.append(float(angles(normals, data.truth)[known].mean()))
     print(f"{seed} {errors[0]:6.2f} -> {errors[1]:6.2f}: {row.label}; {', '.join(row.faults)}", flush=True)
     return errors[0], errors[1]
 

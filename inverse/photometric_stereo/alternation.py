@@ -55,14 +55,13 @@ PATIENCE = 3
 @dataclass
 class State:
     """guess, and depth, (Q,), with the kind of its material. left_out : how far the values that were left out are off
-    what is predicted, in the mean value of each pixel; NaN if there are too few lights. uncertain : its standard error.
+    what is predicted, in the mean value of each pixel; NaN if there are too few lights.
     strength : of its interreflections, as of `View`. start : is it the start?"""
 
     guess: Guess
     depth: np.ndarray
     kind: Kind
     left_out: float = np.nan
-    uncertain: float = 0.0
     halves: float = np.nan
     curl: float = np.nan
     strength: float = np.nan
@@ -80,9 +79,8 @@ class State:
         return not (worse or self.halves > FAR / 2)
 
     def needed_beside(self, simpler: State) -> bool:
-        """Does it predict better by more than the standard error of what is simpler (the rule of one standard error,
-        Breiman et al. 1984, section 3.4.3), and are predictions and halves together better by `GAIN`?"""
-        return self.left_out < simpler.left_out - simpler.uncertain and self.part_of(simpler) < 1 - GAIN
+        """Does it predict better than what is simpler, and are predictions and halves together better by `GAIN`?"""
+        return self.left_out < simpler.left_out and self.part_of(simpler) < 1 - GAIN
 
     def part_of(self, other: State) -> float:
         """The product of `left_out` and `halves` over that of the other one; of `left_out` alone if halves are not
@@ -192,8 +190,7 @@ class Alternations:
         state.strength = view.strength
         if self.judge.able:
             of_view = view.points, view.seen, view.indirect
-            errors = self.judge.errors(state.guess, self.kind, *of_view)
-            state.left_out, state.uncertain = float(errors.mean()), float(errors.std() / np.sqrt(len(errors)))
+            state.left_out = float(self.judge.errors(state.guess, self.kind, *of_view).mean())
             state.halves = _mean(self.judge.disagreement(state.guess, *of_view))
             state.curl = self._curl(state)
 

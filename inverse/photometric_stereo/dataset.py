@@ -26,6 +26,7 @@ from .files import (
     INTENSITIES,
     LEDS,
     LIGHT_DISTANCE,
+    MASK,
     NAMES,
     read_camera,
     read_mask,
@@ -82,7 +83,7 @@ class Dataset:
         if self.mask.sum() != P or channels != 3:
             raise InputError(f"ps: values of the shape {self.values.shape} for {self.mask.sum()} pixels of the mask")
         if not P:
-            raise InputError("ps: the mask is empty")
+            raise InputError(f"ps: the mask is empty; make white in {MASK} what belongs to the object")
         if len(self.lights) != K or self.intensities.shape != (K, 3):
             raise InputError(
                 f"ps: {K} images, {len(self.lights)} lights and {len(self.intensities)} intensities: there must be as "
@@ -311,7 +312,7 @@ class Setup:
 
 def read_setup(folder: Path, *, images: int = 0) -> Setup:
     """Read all of a folder but its images. images, and what is raised: as of `read`."""
-    names, mask = read_names(folder), read_mask(folder / "mask.png")
+    names, mask = read_names(folder), read_mask(folder / MASK)
     near = (folder / LEDS).is_file()
     if near:
         leds = read_leds(folder / LEDS)
@@ -323,11 +324,11 @@ def read_setup(folder: Path, *, images: int = 0) -> Setup:
             raise InputError(f"ps: {DIRECTIONS}, line {lengths.argmin() + 1}: the direction is zero")
         lights = directions / lengths[:, None]
         given = folder / INTENSITIES
-        intensities = read_numbers(given, 3) if given.is_file() else np.ones_like(lights)
+        intensities = read_numbers(given, 3, or_one=True) if given.is_file() else np.ones_like(lights)
     if len(lights) != len(names) or len(intensities) != len(names):
         raise InputError(
             f"ps: {folder.name}: {len(names)} images, {len(lights)} lights, {len(intensities)} intensities: there must "
-            "be as many of each"
+            f"be as many of each; all pictures count that {NAMES} lists, or all that are there: {_few(names)}"
         )
     if (intensities <= 0).any():
         k = int((intensities <= 0).any(1).argmax())
@@ -341,6 +342,11 @@ def read_setup(folder: Path, *, images: int = 0) -> Setup:
     )
     setup = Setup(tuple(names), mask, lights, intensities, read_camera(folder), distance, away)
     return setup.chosen(np.arange(images) * len(names) // images) if 0 < images < len(names) else setup
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first and the last of many names."""
+    return ", ".join(names if len(names) < 6 else [*names[:2], "...", *names[-3:]])
 
 
 def write(folder: Path, data: Dataset) -> None:

@@ -38,8 +38,9 @@ HUBER = 0.05
 #: Largest diffuse colour of a pixel. Above 1, for the scale of the images may be a guess.
 LIGHTEST = 4.0
 
-#: Pixels from which the BSDF is found; and by how much the diagonal of its equations is raised.
-SAMPLED, RIDGE = 2000, 1e-6
+#: Pixels from which the BSDF is found, and of which matrices are multiplied at a time; and by how much the diagonal of
+#: its equations is raised.
+SAMPLED, BLOCK, RIDGE = 2000, 100, 1e-6
 
 
 @dataclass
@@ -276,49 +277,38 @@ class DirectModel(Lighting):
         direction, irradiance = self.light(k, point)
         scale = dr.gather(mi.Float, own(guess.exposures), k) * irradiance
         albedo = dr.gather(mi.Float, own(guess.albedo), p)
+        colour = None if guess.base is None else dr.gather(mi.Color3f, own(guess.base), p)
+        entry, bsdf = p * self.K + k, bsdf_of(self.lobes, guess.weights)
+        table = lambda found: found.numpy().astype(np.float64).T.reshape(count, self.K, -1)
 
-        def design(n: mi.Vector3f) -> tuple[np.ndarray, np.ndarray]:
-            """Of the lobes, (count, K, B), and of what is a pixel's own, (count, K, 1)."""
-            frame = mi.Frame3f(n)
-            wo = frame.to_local(direction)
-            factor = scale * dr.maximum(wo.z, 0)
-            found = [f * factor * albedo for f in ggx.lobes(self.lobes, frame.to_local(view), wo)]
-            found.append(scale * diffuse(guess.base_eta, n, view, direction))
-            dr.eval(found)  # in one kernel: NumPy would ask for one array after the other
-            table = np.array(found, np.float64).T.reshape(count, self.K, B + 1)
-            return table[..., :B], table[..., B:]
+        def shown(n: mi.Vector3f) -> np.ndarray:
+            """Of the guess, with these normals: (count, K, 3)."""
+            found = self._reflected(bsdf, n, view, direction) * (scale * albedo)
+            return table(found if colour is None else found + colour * (scale * own_lobe(n)))
 
-        base = None if guess.base is None else guess.base[pixels][:, None]
-
-        def total(D: np.ndarray, g: np.ndarray) -> np.ndarray:
-            return D @ guess.weights + (0 if base is None else base * g)
-
+        own_lobe = lambda n: diffuse(guess.base_eta, n, view, direction)
         frame = mi.Frame3f(normal)
-        D, g = design(normal)
-        entry = p * self.K + k
+        wi, wo = frame.to_local(view), frame.to_local(direction)
+        factor = scale * albedo * dr.maximum(wo.z, 0)
+        D = [f * factor for f in ggx.lobes(self.lobes, wi, wo)]
+        dr.eval(D)  # in one kernel: NumPy would ask for one array after the other
+        D = np.stack([f.numpy() for f in D], 1).astype(np.float64).reshape(count, self.K, B)
         values, counts = dr.gather(mi.Color3f, self.values, entry), dr.gather(mi.Float, self.counts, entry)
         if self.indirect is not None:
             values -= dr.gather(mi.Color3f, self.indirect, entry)
-        values = np.array(values, np.float64).T.reshape(count, self.K, -1)
-        counts = np.array(counts, np.float64).reshape(count, self.K)
-        here = total(D, g)
+        values, counts, here = table(values), table(counts)[..., 0], shown(normal)
         counts *= np.minimum(1, HUBER * self.scale / np.maximum(np.linalg.norm(values - here, axis=2), 1e-20))
-        own_columns = [(total(*design(dr.normalize(normal + TURN * t))) - here) / TURN for t in (frame.s, frame.t)]
-        own_columns = own_columns if turn else []
-        if base is None:
-            held = np.zeros_like(values)
-        else:
-            own_columns += [g * colour for colour in np.eye(3)]
-            held = base * g
-        values -= held
+        own_columns = [(shown(dr.normalize(normal + TURN * t)) - here) / TURN for t in (frame.s, frame.t) if turn]
+        if guess.base is not None:
+            g = table(scale * own_lobe(normal))
+            own_columns += [g * one for one in np.eye(3)]
+            values -= guess.base[pixels][:, None] * g
         columns = np.stack(own_columns, -1) if own_columns else np.zeros((*values.shape, 0))
-        gram, moments, _ = without_turns(D, columns, values, counts)
-        colours = values.shape[2]
-        alpha, eta = np.array(self.lobes.alpha), np.array(self.lobes.eta)
+        gram, moments = without_turns(D, columns, values, counts, shared=guess.base is not None)
+        alpha, eta, colours = np.array(self.lobes.alpha), np.array(self.lobes.eta), values.shape[2]
         wanted = ~(np.isnan(alpha) & ~np.isnan(eta)) | coat
-        if base is not None:  # a glaze reflects all colours alike
-            fold = np.tile(np.eye(B), (colours, 1))
-            gram, moments, wanted = fold.T @ gram @ fold, fold.T @ moments, ~np.isnan(alpha)
+        if guess.base is not None:
+            wanted = ~np.isnan(alpha)
         parts = len(moments) // B
         i, x = np.flatnonzero(np.tile(wanted, parts)), np.zeros(parts * B)
         if i.size:
@@ -373,34 +363,40 @@ def diffuse(eta: float, n: mi.Vector3f, v: mi.Vector3f, direction: mi.Vector3f) 
 
 
 def without_turns(
-    lobes: np.ndarray, turns: np.ndarray, values: np.ndarray, counts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
+    lobes: np.ndarray, turns: np.ndarray, values: np.ndarray, counts: np.ndarray, *, shared: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations of weights x, (C B,) for C colours, as if T numbers of each pixel followed, such as its normal.
 
     lobes : (P, K, B). turns : changes of the values with these numbers, (P, K, C, T). values : (P, K, C).
-    counts : (P, K).
+    counts : (P, K). shared : the weights are the same for all colours, (B,), as a glaze reflects all alike.
 
     Returns
     -------
-    gram, moments, squares : `x @ gram @ x - 2 moments @ x + squares` is what is left of the squares.
+    gram, moments : `x @ gram @ x - 2 moments @ x` is what is left of the squares, but for a constant.
     """
-    (P, _, B), colours = lobes.shape, values.shape[2]
-    weighted = lobes * counts[..., None]
+    (P, K, B), (_, _, colours, T) = lobes.shape, turns.shape
+    transposed = np.swapaxes(lobes, 1, 2)
     counted = turns * counts[..., None, None]
-    A = np.einsum("pkci,pkcj->pij", counted, turns)
-    diagonal = np.arange(turns.shape[3])
+    A = np.swapaxes(counted.reshape(P, K * colours, T), 1, 2) @ turns.reshape(P, K * colours, T)
+    diagonal = np.arange(T)
     A[:, diagonal, diagonal] = A[:, diagonal, diagonal] * DAMPING + 1e-20
-    of_lobes = np.stack([np.swapaxes(lobes, 1, 2) @ counted[:, :, c] for c in range(colours)], 1)
-    of_lobes = of_lobes.reshape(P, colours * B, len(diagonal))
-    of_values = np.einsum("pkci,pkc->pi", counted, values)
+    by_colour = [counted.sum(2)] if shared else [counted[:, :, c] for c in range(colours)]
+    of_lobes = np.stack([transposed @ x for x in by_colour], 1).reshape(P, len(by_colour) * B, T)
+    of_values = values.reshape(P, 1, K * colours) @ counted.reshape(P, K * colours, T)
     explained = np.linalg.solve(A, np.swapaxes(of_lobes, 1, 2))  # (P, T, C B)
-    # Pixel by pixel: along products so long and thin, threads of BLAS wait for each other again and again, which takes
-    # up to a hundred times as long on processors that have other work
-    gram = np.kron(np.eye(colours), (np.swapaxes(weighted, 1, 2) @ lobes).sum(0))
-    gram -= np.tensordot(of_lobes, explained, ((0, 2), (0, 1)))
-    moments = (np.swapaxes(values, 1, 2) @ weighted).sum(0).ravel() - np.tensordot(of_values, explained, 2)
-    squares = (counts[..., None] * values**2).sum()
-    return gram, moments, float(squares - (of_values * np.linalg.solve(A, of_values[..., None])[..., 0]).sum())
+    squares = sum_of_products(transposed, lobes * counts[..., None])
+    gram = colours * squares if shared else np.kron(np.eye(colours), squares)
+    gram -= sum_of_products(of_lobes, explained)
+    moments = sum_of_products(np.swapaxes(values * counts[..., None], 1, 2), lobes)
+    moments = moments.sum(0) if shared else moments.ravel()
+    return gram, moments - sum_of_products(of_values, explained)[0]
+
+
+def sum_of_products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of matrices, (P, I, J) and (P, J, L): (I, L). Some at a time, so that they stay in the cache, but not as one long
+    and thin product, in which threads of BLAS wait for each other again and again: that takes up to a hundred times as
+    long on processors that have other work."""
+    return sum((a[i : i + BLOCK] @ b[i : i + BLOCK]).sum(0) for i in range(0, len(a), BLOCK))
 
 
 def simplex_least_squares(gram: np.ndarray, moments: np.ndarray, colours: int = 1) -> np.ndarray:

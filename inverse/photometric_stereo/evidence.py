@@ -101,7 +101,8 @@ class Judge:
     """Of the states of one size.
 
     left : (P, K), what is left out. counts : (P, K), which values count, for all states alike. seed : of its random
-    numbers. start : the method of the start, one of `least_squares.METHODS`.
+    numbers. start : the method of the start, one of `least_squares.METHODS`. usable : (P, K), bool, the values that
+    this uses; None: all.
     """
 
     data: Dataset
@@ -110,6 +111,7 @@ class Judge:
     counts: np.ndarray
     seed: int
     start: str
+    usable: np.ndarray | None = None
 
     @property
     def able(self) -> bool:
@@ -146,7 +148,7 @@ class Judge:
         model = DirectModel(few, self.lobes, points=points[pixels], counts=kept, indirect=indirect)
         trial, turn = kind.of(guess.of(pixels), self.lobes), lights is None
         if not turn:
-            trial.normals = self._started(few, trial.exposures, ~left, _of(lights, pixels))
+            trial.normals = self._started(few, pixels, trial.exposures, ~left, _of(lights, pixels))
         rng = np.random.default_rng([self.seed, 19])
         for _ in range(REFITS):
             model.fit_bsdf(trial, rng, coat=kind.coat, turn=turn)
@@ -184,7 +186,7 @@ class Judge:
 
         def found(half: np.ndarray) -> np.ndarray:
             if lights is not None:
-                return self._started(few, guess.exposures, np.broadcast_to(half, counts.shape), lights)
+                return self._started(few, pixels, guess.exposures, np.broadcast_to(half, counts.shape), lights)
             model.counts = own(counts * half)
             turned = guess.of(pixels)
             model.fit_normals(turned, steps=STEPS)
@@ -204,16 +206,22 @@ class Judge:
         return replace(self.data, mask=mask, values=self.data.values[pixels], truth=None)
 
     def _started(
-        self, few: Dataset, exposures: np.ndarray, kept: np.ndarray, lights: tuple[np.ndarray, np.ndarray]
+        self,
+        few: Dataset,
+        pixels: np.ndarray,
+        exposures: np.ndarray,
+        kept: np.ndarray,
+        lights: tuple[np.ndarray, np.ndarray],
     ) -> np.ndarray:
-        """Normals by the method of the start, from values that are kept. As many are of each pixel."""
+        """Normals of some pixels by the method of the start, from values that are kept. As many are of each pixel."""
         directions, irradiance = lights
         count = kept.sum(1).min()
         chosen = np.argsort(~kept, axis=1, kind="stable")[:, :count]
         values = least_squares.as_at_infinity(few.luminance / exposures, irradiance)
         values = np.take_along_axis(values, chosen, 1)
         at = directions[chosen] if directions.ndim == 2 else np.take_along_axis(directions, chosen[..., None], 1)
-        return least_squares.normals(values, at, self.start)
+        usable = None if self.usable is None else np.take_along_axis(self.usable[pixels], chosen, 1)
+        return least_squares.normals(values, at, self.start, usable)
 
 
 def _of(lights: tuple[np.ndarray, np.ndarray], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

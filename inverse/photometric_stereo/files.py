@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import re
 from collections import Counter
@@ -19,7 +20,8 @@ from .vectors import directions_of
 
 log = logging.getLogger(__name__)
 
-DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
+MASK, DIRECTIONS, INTENSITIES, NAMES, LEDS, CAMERA, DISTANCE, LIGHT_DISTANCE = (
+    "mask.png",
     "light_directions.txt",
     "light_intensities.txt",
     "filenames.txt",
@@ -37,22 +39,56 @@ UNEVEN = 1.1
 JPEG, LINEAR = (".jpg", ".jpeg"), (".png", ".tif", ".tiff")
 KINDS = (".exr", *LINEAR, *JPEG)
 
+#: With what files of these kinds begin, whatever their names are.
+BEGINNINGS = {
+    b"\x89PNG": ("PNG", (".png",)),
+    b"\xff\xd8\xff": ("JPEG", JPEG),
+    b"v/1\x01": ("EXR", (".exr",)),
+    b"II*\0": ("TIFF", (".tif", ".tiff")),
+    b"MM\0*": ("TIFF", (".tif", ".tiff")),
+}
+
+#: What has to be in a file, said where it is missing or odd.
+CONTENT = {
+    MASK: "it is a picture that is white where the object is, and black elsewhere",
+    DIRECTIONS: 'it has x y z towards its light for each image, a line each; "rimlight ps calibrate" finds them from '
+    "pictures of a ball",
+    INTENSITIES: "it has r g b of its light for each image, a line each, or one number for all three",
+}
+
+
+def check_there(path: Path) -> None:
+    """Raises FileNotFoundError if there is no such file, with the names of files that may be meant, and with what it
+    has to be."""
+    if path.is_file():
+        return
+    said = f"; {CONTENT[path.name]}" if path.name in CONTENT else ""
+    if path.parent.is_dir():
+        names = {p.name.lower(): p.name for p in path.parent.iterdir() if p.is_file()}
+        same = [name for low, name in names.items() if Path(low).stem == path.stem.lower()]
+        close = same or [names[low] for low in difflib.get_close_matches(path.name.lower(), names, 3, 0.8)]
+        digits = lambda name: re.findall(r"\d+", name)  # 004.png is not meant where 005.png is missing
+        close = [name for name in close if digits(name) == digits(path.name)]
+        said += f'; is it "{close[0]}"?' if close else ""
+    raise FileNotFoundError(f'ps: there is no file "{path}"{said}')
+
 
 # ---------------------- Text ----------------------
 
 
 def read_text(path: Path) -> str:
     """Raises ValueError if it is not text in UTF-8, OSError if there is none."""
-    if not path.is_file():
-        raise FileNotFoundError(f'ps: there is no file "{path}"')
+    check_there(path)
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"ps: {path.name} is not text in UTF-8; save it as such") from None
 
 
-def read_numbers(path: Path, columns: int) -> np.ndarray:
+def read_numbers(path: Path, columns: int, *, or_one: bool = False) -> np.ndarray:
     """A text file of numbers, with spaces, commas or semicolons between them: (lines, columns).
+
+    or_one : lines may have one number, which stands for all columns.
 
     Raises
     ------
@@ -67,12 +103,14 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
             row = [float(word) for word in words]
         except ValueError:
             row = []
+        row = row * columns if or_one and len(row) == 1 else row
         if len(row) != columns or not np.isfinite(row).all():
             got = line.strip() if len(line) < 60 else line.strip()[:57] + "..."
             commas = "." not in line and re.search(r"\d,\d", line) is not None
             raise InputError(
                 f'ps: {path.name}, line {k}: expected {columns} finite number{"s" * (columns > 1)}, got "{got}"'
                 + "; take a header away, or begin it with #" * (not row)
+                + (f"; {CONTENT[path.name]}" if row and path.name in CONTENT else "")
                 + "; write decimals with a point" * (commas and len(row) > columns)
             )
         rows.append(row)
@@ -83,16 +121,20 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
 
 def read_names(folder: Path) -> list[str]:
     """Of the images of a folder: those that `filenames.txt` lists, else all pictures but masks, truths and hidden
-    files, by name, where numbers count as such: 2 comes before 10.
+    files, by name, where numbers count as such: 2 comes before 10. The list may have quotation marks, comments, lines
+    that begin with #, and the backslashes of Windows.
 
     Raises
     ------
-    ValueError : one is listed twice. OSError : there is no such folder.
+    ValueError : one is listed twice; there are none. OSError : there is no such folder.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f'ps: there is no folder "{folder}"')
     if (folder / NAMES).is_file():
-        names = [line.strip() for line in read_text(folder / NAMES).splitlines() if line.strip()]
+        lines = (line.strip().strip("\"'") for line in read_text(folder / NAMES).splitlines())
+        there = lambda name: (folder / name).is_file()
+        names = [line for line in lines if line and (there(line) or not line.startswith("#"))]
+        names = [name if there(name) else Path(name.replace("\\", "/")).as_posix() for name in names]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
             raise InputError(f'ps: {NAMES} lists "{twice[0]}" twice')
         return names
@@ -100,7 +142,19 @@ def read_names(folder: Path) -> list[str]:
     hidden = lambda p: p.name.startswith(".")  # such as ._1.png, which macOS writes beside 1.png
     pictures = (p for p in folder.iterdir() if p.suffix.lower() in KINDS and p.is_file())
     names = [p.name for p in pictures if not (other(p) or hidden(p))]
+    if not names:
+        raise InputError(f'ps: there are no pictures in "{folder}"{_elsewhere(folder)}')
     return sorted(names, key=lambda name: [int(w) if w.isdecimal() else w for w in re.split(r"(\d+)", name)])
+
+
+def _elsewhere(folder: Path) -> str:
+    """Where pictures may be instead, and what to do then."""
+    below = [p for p in sorted(folder.glob("*/*")) if p.suffix.lower() in KINDS]
+    if below:
+        name = below[0].relative_to(folder).as_posix()
+        return f'; move those of "{below[0].parent.name}" there, or list them in {NAMES}, as {name}'
+    others = sorted({p.suffix for p in folder.iterdir() if p.is_file()} - {"", ".txt", ".csv", ".mat", *KINDS})
+    return f"; make EXR, PNG or TIFF (16 bits, linear), or JPEG of the files {', '.join(others)}" if others else ""
 
 
 def read_camera(folder: Path) -> np.ndarray | None:
@@ -131,6 +185,8 @@ def read_pixels(path: Path, mask: np.ndarray) -> np.ndarray:
         raise InputError(
             f'ps: "{path.name}" is of a format that is not read; make it EXR, PNG or TIFF (16 bits, linear), or JPEG'
         )
+    check_there(path)
+    _check_kind(path)
     picture = _numbers_of_picture(path)
     if path.suffix.lower() in JPEG:
         _check_upright(path)
@@ -145,6 +201,18 @@ def read_pixels(path: Path, mask: np.ndarray) -> np.ndarray:
     if path.suffix.lower() in JPEG:
         pixels = srgb_to_linear(pixels)
     return np.broadcast_to(pixels, (len(pixels), 3))
+
+
+def _check_kind(path: Path) -> None:
+    """Raises ValueError if a picture is not of the kind that its name says, on which depends how it is decoded."""
+    with path.open("rb") as file:
+        first = file.read(4)
+    for beginning, (name, suffixes) in BEGINNINGS.items():
+        if first.startswith(beginning) and path.suffix.lower() not in suffixes:
+            raise InputError(
+                f'ps: "{path.name}" is a {name} file, whatever its name says; rename it so that it ends with '
+                f"{suffixes[0]}, for that says how its values are decoded"
+            )
 
 
 def _check_upright(path: Path) -> None:
@@ -170,6 +238,8 @@ def doubts(folder: Path, names: Sequence[str]) -> list[str]:
             f"The pictures are of several kinds: {listed}. Only JPEG is decoded from sRGB, and PNG and TIFF of whole "
             "numbers are divided by the largest one, EXR is not: export all pictures in the same way."
         )
+    if not (folder / LEDS).is_file():
+        said += _behind(folder)
     if not any((folder / name).is_file() for name in (LEDS, INTENSITIES)):
         lengths = np.linalg.norm(read_numbers(folder / DIRECTIONS, 3), axis=1)
         if lengths.max() > UNEVEN * lengths.min():
@@ -179,6 +249,18 @@ def doubts(folder: Path, names: Sequence[str]) -> list[str]:
                 "they must be relative to the object."
             )
     return said
+
+
+def _behind(folder: Path) -> list[str]:
+    """Lights behind the object, where they shine on its border only, beside others in front of it."""
+    lines = np.flatnonzero(read_numbers(folder / DIRECTIONS, 3)[:, 2] <= 0) + 1
+    if not lines.size:
+        return []
+    listed = ", ".join(map(str, lines[:10])) + ", ..." * (lines.size > 10)
+    return [
+        f"The lights of line {listed} of {DIRECTIONS} have a z of 0 or less, and so are behind the object, as the "
+        "camera sees it. If they were in front of it, correct the signs."
+    ]
 
 
 def kind(path: Path) -> str:
@@ -192,6 +274,7 @@ def kind(path: Path) -> str:
 
 def _numbers_of_picture(path: Path) -> np.ndarray:
     """(H, W, C), float32."""
+    check_there(path)
     try:
         return read_picture(path)[0]
     except (OSError, ValueError) as error:

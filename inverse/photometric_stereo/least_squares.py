@@ -1,6 +1,8 @@
 """Normals of diffuse surfaces: least squares (Woodham 1980), and how to keep shadows and highlights out of them.
 
 All for lights at infinity, or directions of the lights at each pixel: `lights` is (K, 3) or (P, K, 3), `values` (P, K).
+What does not count at all, such as clipped values, has a weight of 0; pixels of which too few values are left without
+it keep them all (`weights_of`).
 """
 
 from __future__ import annotations
@@ -50,17 +52,33 @@ def ranks(values: np.ndarray) -> np.ndarray:
     return np.argsort(np.argsort(values, axis=1), axis=1) / (values.shape[1] - 1)
 
 
-def trimmed(values: np.ndarray, lights: np.ndarray, low: float = 0.2, high: float = 0.8) -> np.ndarray:
+def trimmed(
+    values: np.ndarray, lights: np.ndarray, weights: np.ndarray | None = None, low: float = 0.2, high: float = 0.8
+) -> np.ndarray:
     """Least squares without the darkest and the brightest values of each pixel, where what is left tells all three
-    numbers: (P, 3)."""
+    numbers: (P, 3).
+
+    weights : 0 or 1, default 1.
+    """
     found = np.empty((len(values), 3))
     for i in range(0, len(values), BLOCK):
         part, of_part = values[i : i + BLOCK], lights if lights.ndim == 2 else lights[i : i + BLOCK]
+        given = np.ones(part.shape, bool) if weights is None else weights[i : i + BLOCK] > 0
         rank = ranks(part)
-        kept = (rank >= low) & (rank <= high)
-        kept |= ~telling(kept, of_part)[:, None]
+        inside = (rank >= low) & (rank <= high)
+        kept = inside & given
+        for wider in (inside, given):
+            kept |= wider & ~telling(kept, of_part)[:, None]
         found[i : i + BLOCK] = least_squares(part, of_part, kept.astype(part.dtype))
     return found
+
+
+def weights_of(usable: np.ndarray | None, lights: np.ndarray) -> np.ndarray | None:
+    """Weights, (P, K), of values of which only some are `usable`, (P, K), bool, or all (None): 1, or 0 for those that
+    are not, where the others tell normals."""
+    if usable is None or usable.all():
+        return None
+    return (usable | ~telling(usable, lights)[:, None]).astype(np.float32)
 
 
 def telling(kept: np.ndarray, lights: np.ndarray) -> np.ndarray:
@@ -94,12 +112,13 @@ def check_lights(lights: np.ndarray) -> None:
         )
 
 
-def reweighted(values: np.ndarray, lights: np.ndarray) -> np.ndarray:
+def reweighted(values: np.ndarray, lights: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Least sums of absolute residuals, by iteratively reweighted least squares: (P, 3)."""
     floor = SMALL * np.abs(values).mean(1, keepdims=True) + np.finfo(np.float32).tiny
-    b = least_squares(values, lights)
+    given = 1.0 if weights is None else weights
+    b = least_squares(values, lights, weights)
     for _ in range(ITERATIONS):
-        b = least_squares(values, lights, 1 / np.maximum(np.abs(predicted(b, lights) - values), floor))
+        b = least_squares(values, lights, given / np.maximum(np.abs(predicted(b, lights) - values), floor))
     return b
 
 
@@ -111,8 +130,12 @@ def predicted(b: np.ndarray, lights: np.ndarray) -> np.ndarray:
 METHODS = {"least squares": least_squares, "trimmed": trimmed, "reweighted": reweighted}
 
 
-def normals(values: np.ndarray, lights: np.ndarray, method: str = "trimmed") -> np.ndarray:
+def normals(
+    values: np.ndarray, lights: np.ndarray, method: str = "trimmed", usable: np.ndarray | None = None
+) -> np.ndarray:
     """Unit normals, (P, 3), by one of `METHODS`. Those that would face away from the camera are turned to its side.
+
+    usable : which values are, (P, K), bool, see `weights_of`; default all.
 
     Raises
     ------
@@ -120,7 +143,7 @@ def normals(values: np.ndarray, lights: np.ndarray, method: str = "trimmed") -> 
     """
     if method not in METHODS:
         raise InputError(f'ps: unknown method "{method}", expected one of {", ".join(METHODS)}')
-    return facing(METHODS[method](values.astype(np.float64), lights))
+    return facing(METHODS[method](values.astype(np.float64), lights, weights_of(usable, lights)))
 
 
 def facing(b: np.ndarray) -> np.ndarray:

@@ -173,7 +173,7 @@ def fingerprints(data: Dataset) -> dict[str, str]:
 
 
 def _facts_of(state: State) -> dict[str, Any]:
-    facts = {name: getattr(state, name) for name in ("left_out", "uncertain", "halves", "curl", "strength", "start")}
+    facts = {name: getattr(state, name) for name in ("left_out", "halves", "curl", "strength", "start")}
     return {**facts, "kind": dataclasses.astuple(state.kind), "base_eta": float(state.guess.base_eta)}
 
 

@@ -260,7 +260,8 @@ class Reconstruction:
         if self.scale != 1:
             level = dataclasses.replace(level, values=level.values * np.float32(self.scale))
         counts = start.counts(self.data, level, size, options.dark)
-        judge = Judge(level, self.lobes, left_out(level, options.seed), counts, options.seed, options.start)
+        method = start.method(self.data, level, size, options)
+        judge = Judge(level, self.lobes, left_out(level, options.seed), counts, options.seed, *method)
         # With too few lights to judge by, the start is kept, and one alternation tells how far it is off the images
         plan = [(now.kind, options.iterations[now.level] if judge.able else 1)]
         if now.level == 0 and judge.able and len(self.kinds) > 1:
@@ -296,7 +297,8 @@ class Reconstruction:
     def _begin(self, most: int, coarse: Result | None) -> View | None:
         """Judge the start of a size, and begin its alternations. Returns the view of their first state, if known."""
         now, options, work = self.now, self.options, self.work
-        guess = start.guess(work.data, self.lobes, work.judge.counts, options)
+        judge = work.judge
+        guess = start.guess(work.data, self.lobes, judge.counts, options, (judge.start, judge.usable))
         now.start, view = work.judged_start(guess, start.flat(work.data).lighting(), self.kinds)
         if coarse is None:
             now.course = Course(copy.deepcopy(now.start), most)

@@ -26,13 +26,58 @@ log = logging.getLogger(__name__)
 #: Pixels without which there is no surface.
 FEWEST = 9
 
+#: Pixels from which it is told whether clipped values are of use, at most, and parts of the lights that are left out
+#: in turns for that. Deviations count at most so much, of the mean value of the pixel.
+JUDGED, PARTS, MOST = 1000, 5, 0.5
+
+
+def clipped(data: Dataset, size: float) -> np.ndarray:
+    """Which values of a level are clipped, even in part: (P, K), bool."""
+    return data.clipped if size == 1 else data.blocks(round(1 / size))[1](data.clipped.astype(np.float32)) > 0
+
 
 def counts(data: Dataset, level: Dataset, size: float, dark: float) -> np.ndarray:
     """How much values of a level count, (P, K): 0 for the darkest of each pixel, and what is clipped, even in part."""
-    clipped = data.clipped
-    if size < 1:
-        clipped = data.blocks(round(1 / size))[1](clipped.astype(np.float32)) > 0
-    return (least_squares.brightest(level.luminance, dark) & ~clipped).astype(np.float32)
+    return (least_squares.brightest(level.luminance, dark) & ~clipped(data, size)).astype(np.float32)
+
+
+def method(data: Dataset, level: Dataset, size: float, options: Options) -> tuple[str, np.ndarray | None]:
+    """By which method the start of a level is found, and from which values, (P, K), bool, or from all (None).
+
+    It is that of the options, from all values, unless some are clipped. Then it may be from those that are not clipped,
+    or not dark either; and least squares from these, for what is too bright is known then. But few may be left, or
+    those in shadow. So a fifth of the lights after the other is left out, and what predicts their values best is taken,
+    if it is better than the first by more than the standard error of this difference.
+    """
+    given = options.start, None
+    if not data.clipped.any() or level.values.shape[1] <= least_squares.FEWEST:
+        return given
+    pixels = np.unique(np.linspace(0, len(level.values) - 1, JUDGED).astype(int))
+    directions, irradiance = flat(level).lighting()
+    values = least_squares.as_at_infinity(level.luminance, irradiance)[pixels].astype(np.float64)
+    directions = directions if directions.ndim == 2 else directions[pixels]
+    lit, over = least_squares.brightest(level.luminance, options.dark), clipped(data, size)
+    usable = ~over, lit & ~over
+    mean = np.maximum(values.mean(1, keepdims=True), 1e-30)
+
+    def off(name: str, used: np.ndarray | None) -> np.ndarray:
+        total = np.zeros(len(pixels))
+        for part in range(PARTS):
+            out = np.arange(values.shape[1]) % PARTS == part
+            lights = directions[..., ~out, :]
+            weights = None if used is None else least_squares.weights_of(used[pixels][:, ~out], lights)
+            b = least_squares.METHODS[name](values[:, ~out], lights, weights)
+            predicted = np.maximum(least_squares.predicted(b, directions[..., out, :]), 0)
+            more = predicted - values[:, out]
+            more[over[pixels][:, out] & (more > 0)] = 0  # what is clipped may have been brighter
+            total += (lit[pixels][:, out] * np.minimum(np.abs(more) / mean, MOST)).sum(1)
+        return total
+
+    first = off(*given)
+    names = dict.fromkeys((options.start, "least squares"))
+    gains = {(name, k): first - off(name, used) for name in names for k, used in enumerate(usable)}
+    (name, k), gain = max(gains.items(), key=lambda item: item[1].mean())
+    return (name, usable[k]) if gain.mean() > gain.std() / np.sqrt(len(pixels)) else given
 
 
 def check(data: Dataset) -> None:
@@ -76,15 +121,20 @@ def flat(data: Dataset) -> DirectModel:
     return DirectModel(data, ggx.Lobes((np.nan,), (np.nan,)), points=points)
 
 
-def guess(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, options: Options) -> Guess:
-    """Diffuse, with exposures."""
+def guess(
+    data: Dataset,
+    lobes: ggx.Lobes,
+    counts: np.ndarray,
+    options: Options,
+    of: tuple[str, np.ndarray | None] | None = None,
+) -> Guess:
+    """Diffuse, with exposures. of : as of `method`; default: the method of the options, from all values."""
     plane = flat(data)
     directions, irradiance = plane.lighting()
     values = least_squares.as_at_infinity(data.luminance, irradiance)
-    solve = least_squares.METHODS[options.start]
-    if data.clipped.any():  # what is too bright is known then, and need not be guessed
-        told = least_squares.telling(counts > 0, directions)[:, None]
-        solve = lambda values, lights: least_squares.least_squares(values, lights, np.where(told, counts, 1.0))
+    name, usable = of or (options.start, None)
+    counted = least_squares.weights_of(usable, directions)
+    solve = lambda values, lights: least_squares.METHODS[name](values, lights, counted)
     exposures = np.ones(plane.K)
     for _ in range(3 if options.exposures else 0):
         predicted = least_squares.predicted(solve(values / exposures, directions), directions)

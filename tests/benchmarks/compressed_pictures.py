@@ -53,7 +53,8 @@ def row(number: int, quality: int, clipped: float, folder: Path) -> str:
     off = compression.judged(folder, data.names, data.mask).deviation
     options = ps.Options(brightness=brightness, max_depth=4, resolutions=(0.5, 1.0), iterations=(6, 4))
     counts = start.counts(data, data, 1.0, options.dark)
-    begun = angles(start.guess(data, ggx.read_dictionary()[0], counts, options).normals, made.truth).mean()
+    method = start.method(data, data, 1.0, options)
+    begun = angles(start.guess(data, ggx.read_dictionary()[0], counts, options, method).normals, made.truth).mean()
     found = ps.reconstruct(data, options, progress=False)
     after = angles(found.guess.normals, made.truth).mean()
     return f"| {number} | {shape} | {100 * off:.0f} | {begun:.2f} | {after:.2f} | {found.verdict} |"

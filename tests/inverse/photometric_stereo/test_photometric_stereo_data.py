@@ -289,7 +289,7 @@ THREE = "0 0 1\n" * 3
         (replaced("light_intensities.txt", "1 1 1\n" * 3 + "1 0 1"), False, "light 4 has no intensity"),
         (without("light_directions.txt"), False, 'ps: there is no file ".*light_directions.txt"'),
         (replaced("light_directions.txt", ""), False, "ps: light_directions.txt is empty"),
-        (replaced("light_directions.txt", "0 0 1\n0 0\n"), False, 'line 2: expected 3 finite numbers, got "0 0"$'),
+        (replaced("light_directions.txt", "0 0 1\n0 0\n"), False, 'line 2: expected 3 .*, got "0 0"; it has x y z'),
         (replaced("light_directions.txt", "0 0 1\n0 nan 1\n"), False, "line 2: expected 3 finite numbers"),
         (replaced("light_directions.txt", "x y z\n0 0 1\n"), False, 'line 1: .* got "x y z"; take a header away'),
         (replaced("light_directions.txt", "0 0 1\n", "utf-16"), False, "light_directions.txt is not text in UTF-8"),

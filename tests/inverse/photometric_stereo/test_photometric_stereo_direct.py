@@ -204,7 +204,7 @@ def test_coat_needs_evidence(plastic: Scene, coat: bool) -> None:
             model.fit_normals(guess)
         judge, seen = judge_of(data, lobes), seen_by_all(data)
         errors, halves = judge.errors(guess, kind, *seen), np.nanmean(judge.disagreement(guess, *seen))
-        states.append(State(guess, plastic.depth, kind, errors.mean(), errors.std() / np.sqrt(len(errors)), halves))
+        states.append(State(guess, plastic.depth, kind, errors.mean(), halves))
     plain, with_coat = states
     assert with_coat.needed_beside(plain) == coat
     found = states[coat].guess

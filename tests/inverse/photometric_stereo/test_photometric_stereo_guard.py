@@ -191,14 +191,13 @@ def test_a_result_whose_halves_have_nothing_in_common_is_not_taken() -> None:
 
 
 def test_other_materials_must_be_clearly_better() -> None:
-    """By more than a standard error, and predictions and halves of the lights together by a part."""
-    state = lambda left_out, halves, kind: alternation.State(
-        None, None, kind, left_out=left_out, uncertain=0.004, halves=halves
-    )
+    """Predictions and halves of the lights together by a part; and predictions must not be worse."""
+    state = lambda left_out, halves, kind: alternation.State(None, None, kind, left_out=left_out, halves=halves)
     plain = state(0.1, 5.0, Kind())
     assert state(0.09, 4.0, Kind(several=True)).needed_beside(plain)
     assert not state(0.09, 4.5, Kind(several=True)).needed_beside(plain)
-    assert not state(0.097, 3.0, Kind(several=True)).needed_beside(plain)
+    assert state(0.099, 3.7, Kind(several=True)).needed_beside(plain)
+    assert not state(0.101, 3.0, Kind(several=True)).needed_beside(plain)
 
 
 def test_states_are_compared_by_predictions_and_halves_together() -> None:
@@ -444,6 +443,30 @@ def test_clipped_images_are_reported_and_do_not_count(matte: Dataset, caplog: py
     assert found.error < 0.6 * counted.error
 
 
+@pytest.mark.parametrize("method", least_squares.METHODS)
+def test_starts_of_clipped_images(matte: Dataset, method: str) -> None:
+    """Clipped at half of the brightest tenth, they leave that out, with a start twice as good or nearly. Trimming has
+    no need of it where a few highlights are clipped and as many values are in shadow, and stays as robust as it is."""
+    rng, most = np.random.default_rng(3), matte.values.max()
+    few = np.where((rng.random(matte.values.shape[:2]) < 0.1)[..., None], most, matte.values)
+    few = np.where((rng.random(matte.values.shape[:2]) < 0.1)[..., None], 0, few)
+    for values, least in (
+        (np.minimum(matte.values, 0.5 * np.quantile(matte.values, 0.9)), 1.4),
+        (np.minimum(few, 0.95 * most), 1.0),
+    ):
+        data, options = dataclasses.replace(matte, values=values), ps.Options(start=method, exposures=False)
+        counts, of = start.counts(data, data, 1.0, options.dark), start.method(data, data, 1.0, options)
+        error = lambda used, name, data=data: angles(
+            least_squares.normals(data.luminance, data.lights, name, used), data.truth
+        ).mean()
+        before = error(None, method)
+        errors = [before, *(error(u, n) for n in (method, "least squares") for u in (~data.clipped, counts > 0))]
+        found = start.guess(data, ggx.Lobes((np.nan,), (np.nan,)), counts, options, of).normals
+        found = angles(found, data.truth).mean()
+        print(data.clipped.mean(), errors, of[0], found)
+        assert data.clipped.any() and found < before / least + 1e-6 and found < 1.2 * min(errors)
+
+
 @pytest.mark.parametrize(("kind", "reported"), [("sRGB", True), ("linear", False)])
 def test_pictures_of_8_bits_encoded_as_srgb(matte: Dataset, tmp_path, caplog, kind: str, reported: bool) -> None:
     folder = tmp_path / "data"
@@ -508,5 +531,5 @@ def test_beside_the_start_no_material_costs_more() -> None:
     assert now.best is begun
     now.end_trial(state(0.0820, 8.06, kind=several))
     assert now.best.kind == now.best_so_far().kind == several
-    now.end_trial(state(0.0815, 7.54, uncertain=0.0046, kind=Kind(True, True)))
+    now.end_trial(state(0.0815, 7.54, kind=Kind(True, True)))
     assert now.best.kind == several

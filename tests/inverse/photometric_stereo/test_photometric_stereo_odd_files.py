@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -73,7 +74,62 @@ def test_hidden_files_are_no_pictures(folder: Path) -> None:
     assert dataset.read(folder).names == tuple(f"{k + 1:03d}.exr" for k in range(LIGHTS))
 
 
+@pytest.mark.parametrize("line", ['"{}"', "'{}'", ".\\{}", "{}\r"], ids=["quotes", "single quotes", "Windows", "CR"])
+def test_lists_of_other_programs(folder: Path, line: str) -> None:
+    text = "# the images\n" + "\n".join(line.format(f"{k + 1:03d}.exr") for k in range(LIGHTS))
+    (folder / "filenames.txt").write_text(text, newline="")
+    assert dataset.read(folder).names == tuple(f"{k + 1:03d}.exr" for k in range(LIGHTS))
+
+
+def elsewhere(folder: Path, names: str) -> None:
+    """Pictures go to a folder of this name, or become files of this kind."""
+    (folder / "filenames.txt").unlink()
+    (folder / "images").mkdir()
+    for picture in folder.glob("0*.exr"):
+        picture.rename(folder / "images" / picture.name if names == "images" else picture.with_suffix(names))
+
+
+def renamed(folder: Path, before: str, after: str) -> None:
+    (folder / before).rename(folder / after)
+
+
+def one_more(folder: Path) -> None:
+    (folder / "filenames.txt").unlink()
+    shutil.copy(folder / "001.exr", folder / "preview.exr")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: renamed(f, "mask.png", "Mask.jpg"), 'mask.png"; it is a picture .* is it "Mask.jpg"?$'),
+        (lambda f: renamed(f, "005.exr", "005.EXR"), '005.exr"; is it "005.EXR"?$'),
+        (lambda f: renamed(f, "005.exr", "x"), '005.exr"$'),
+        (lambda f: renamed(f, "light_directions.txt", "Light_Direction.txt"), 'calibrate" .* is it "Light_D.*.txt"?$'),
+        (lambda f: elsewhere(f, "images"), "ps: there are no pictures in .*images.* list them .* as images/001.exr$"),
+        (lambda f: elsewhere(f, ".CR2"), "ps: there are no pictures in .*; make EXR, PNG .* of the files .CR2$"),
+        (one_more, "13 images, .* all that are there: 001.exr, 002.exr, ..., 011.exr, 012.exr, preview.exr$"),
+        (lambda f: Image.new("L", (N, N)).save(f / "mask.png"), "the mask is empty; make white in mask.png what"),
+    ],
+)
+def test_what_is_missing(folder: Path, change: Callable[[Path], None], message: str) -> None:
+    """Is said with what it should be, and which file may be meant."""
+    change(folder)
+    for read in (dataset.read, inspection.inspect):
+        with pytest.raises((ValueError, OSError), match=message.replace("?$", r"\?$")):
+            read(folder)
+
+
 # ------------------------------------------------------------------ pictures
+
+
+@pytest.mark.parametrize(("of", "suffix"), [("JPEG", ".png"), ("PNG", ".jpg"), ("TIFF", ".png"), ("PNG", ".tif")])
+def test_pictures_of_other_kinds_than_their_names_say(folder: Path, of: str, suffix: str) -> None:
+    """Some are decoded from sRGB, others are not."""
+    Image.new("RGB", (N, N), "gray").save(folder / f"1{suffix}", format=of)
+    names = (folder / "filenames.txt").read_text().split()
+    (folder / "filenames.txt").write_text("\n".join([f"1{suffix}", *names[1:]]))
+    with pytest.raises(ValueError, match=f'^ps: "1{suffix}" is a {of} file, whatever its name says; rename it'):
+        dataset.read(folder)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -163,3 +219,28 @@ def test_a_lamp_that_was_off(folder: Path) -> None:
     (folder / "light_intensities.txt").write_text("\n".join(rows))
     with pytest.raises(ValueError, match=r'light 4 has no intensity.* take it out .* and "004.exr" out of the folder'):
         dataset.read(folder)
+
+
+def test_one_number_of_a_light(matte: Dataset, folder: Path) -> None:
+    """Stands for all three of its intensity."""
+    np.savetxt(folder / "light_intensities.txt", np.full(LIGHTS, 2.0))
+    np.testing.assert_allclose(dataset.read(folder).values, matte.values / 2, rtol=1e-5)
+    (folder / "light_intensities.txt").write_text("2 2\n" * LIGHTS)
+    with pytest.raises(ValueError, match=r"line 1: expected 3 .* it has r g b of its light .* or one number"):
+        dataset.read(folder)
+
+
+@pytest.mark.parametrize("row", ["1 {}", "0.5", "30 45"], ids=["a number before", "one", "angles"])
+def test_lines_of_directions(matte: Dataset, folder: Path, row: str) -> None:
+    text = "\n".join(row.format(f"{x:.3f} {y:.3f} {z:.3f}") for x, y, z in matte.lights)
+    (folder / "light_directions.txt").write_text(text)
+    with pytest.raises(ValueError, match=r"light_directions.txt, line 1: expected 3 finite numbers.* it has x y z"):
+        dataset.read(folder)
+
+
+def test_some_lights_behind_the_object(matte: Dataset, folder: Path) -> None:
+    """Of which only signs are wrong: three of twelve, too many to be told one by one from the images."""
+    signs = np.ones((LIGHTS, 1))
+    signs[[3, 6, 8]] = -1
+    np.savetxt(folder / "light_directions.txt", matte.lights * signs)
+    assert doubts(folder)[0].startswith("The lights of line 4, 7, 9 of light_directions.txt have a z of 0 or less")
