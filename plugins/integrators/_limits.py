@@ -267,6 +267,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"the derivative is off by up to a tenth in parts of the shading of {', '.join(shaded)} (sdfgrid), in "
             "lights without a size, at the shadow that it throws on itself."
         )
+    shiny = names(g.inner for g in grids_of(geometry) if g in moving.on_film and is_mirror(g.inner))
+    if shiny:
+        limits.append(
+            f"the derivative is noisy, and off by up to a fifth, in what {', '.join(shiny)} (sdfgrid) show, perfect "
+            "mirrors or glass that move. Give them a roughness, or replace them by meshes."
+        )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:
         limits.append(

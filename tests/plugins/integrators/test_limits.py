@@ -5,6 +5,7 @@ from __future__ import annotations
 import as_written
 import cases
 import drjit as dr
+import grids
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -289,6 +290,14 @@ def test_lamps_that_move_in_smooth_bulbs_are_warned_about(kind, glass, place, ke
 
 
 # ---------------------- Textures that slide ----------------------
+
+
+@pytest.mark.parametrize(("bsdf", "missing"), [("conductor", 1), ("dielectric", 1), ("roughconductor", 0)])
+def test_grids_that_are_mirrors_or_glass(bsdf, missing):
+    thing = {"type": "sdfgrid", "grid": grids.grid(n=8)["grid"], "bsdf": {"type": bsdf}}
+    scene = cases.scene(sensor=cases.camera(), thing=thing, sky=cases.constant())
+    messages = said(scene, "thing.to_world", kind="prb_edge", max_depth=3)
+    assert sum('in what "thing" (sdfgrid) show' in m for m in messages) == missing
 
 
 def checkered(shape: str) -> dict:
