@@ -39,6 +39,7 @@ from mirrors import MIRRORS, ball_of_index
 from polished import POLISHED
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
+from sliding_textures import SLIDING, unsampled_lamp
 from touching_lamps import TOUCHING
 
 from rimlight.checks import FiniteDifferences, Motion, derivative_image, finite_differences
@@ -943,6 +944,18 @@ CASES = [
     *(
         Case(k, *of, spp=64, runs=24, integrator=upto(depth), reference_spp=1024)
         for k, (*of, depth) in TOUCHING.items()
+    ),
+    *(
+        Case(
+            k,
+            *of,
+            spp=64,
+            runs=16,
+            integrator=upto(depth),
+            reference_spp=1024,
+            reference_scene=unsampled_lamp if k == "lamp_slides" else None,
+        )
+        for k, (*of, depth) in SLIDING.items()
     ),
     *(Case(k, *of, spp=256, runs=24, integrator=upto(depth), reference_spp=1024) for k, (*of, depth) in LEAVES.items()),
     *(

@@ -18,6 +18,7 @@ finds the shadows of small lights, is divided as between the sampling of lights 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -67,13 +68,20 @@ class ShadingBoundary:
     silhouettes : of all shapes; refitted by the caller.
     moving : the shapes that move. At points that stand still, only the first group of edges matters then; None: all
         edges matter at all points.
+    sliding : those over which the lines of their textures move.
     """
 
-    _NUMBERS = ("transmits", "glossy", "smooth", "soft", "veils", "emission", "emission_at_first", "several")
+    _NUMBERS = ("transmits", "glossy", "smooth", "soft", "veils", "emission", "emission_at_first", "several", "crossed")
     _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps", "from_edges")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
-    def __init__(self, scene: mi.Scene, silhouettes: Silhouettes, moving: list[mi.Shape] | None):
+    def __init__(
+        self,
+        scene: mi.Scene,
+        silhouettes: Silhouettes,
+        moving: list[mi.Shape] | None,
+        sliding: Sequence[mi.Shape] = (),
+    ):
         self.silhouettes = silhouettes
         self.geometry = geometry = silhouettes.geometry
         self.moving_shapes = None if moving is None else [pointer(s) for s in moving]
@@ -87,6 +95,9 @@ class ShadingBoundary:
         #: Do shapes cut through lamps? That is no shadow, which would be found from the lamp.
         shapes = (*geometry.meshes, *geometry.analytic)
         self.cut_lamps = any(shapes[i].is_emitter() for lines in geometry.lines for i in lines.shapes)
+        #: Do lines of textures move over surfaces, and over lamps?
+        self.crossed = silhouettes.textures is not None and bool(sliding)
+        self.crossed_lamps = self.crossed and any(s.is_emitter() for s in sliding)
         #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
         lights = [i for i, e in enumerate(emitters) if not e.flags() & mi.EmitterFlags.Delta]
         self.lights = mi.UInt32(lights or [0])  # Dr.Jit 1.5 cannot freeze empty arrays
@@ -108,7 +119,7 @@ class ShadingBoundary:
 
     def _counts_at_first(self, emitter: mi.Emitter) -> bool:
         if emitter.flags() & mi.EmitterFlags.Surface:
-            return self.glossy or self.cut_lamps
+            return self.glossy or self.cut_lamps or self.crossed_lamps
         return not hasattr(emitter, "light_count") or emitter.background is not None
 
     def refit(self) -> None:
@@ -205,7 +216,8 @@ class ShadingBoundary:
                 crease = self.silhouettes.crease(e, outline) * near
                 # The closer an edge is, the faster its direction turns.
                 turn = dr.rsqrt(r2) * self.silhouettes.preferred(e, use)
-                return e, dr.max(f) * arc * turn * dr.select(seen_past | outline.is_line, 1, crease)
+                whole = seen_past | outline.is_line | outline.crosses
+                return e, dr.max(f) * arc * turn * dr.select(whole, 1, crease)
 
             many = tracer.scatters(2) or tracer.lamps is not None
             number = MORE if self.glossy or self.veils else CANDIDATES if many else 1
@@ -292,8 +304,8 @@ class ShadingBoundary:
             outward, n_dl = self._outward(outline, across, ω, n_dl, sampler, active)
             # Of a crease, both sides are faces of its own.
             near = dr.detach(1 - division.held(dr.square(distance), ω))
-            active &= (outward != 0) | (near > 0) | (~emission & self.veils)
-            n_dl = dr.select(active, n_dl, 0)
+            near_or_crossed = (near > 0) | outline.crosses
+            active &= (outward != 0) | near_or_crossed | (~emission & self.veils)
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
             def see(side, active, slack=1):
@@ -302,8 +314,9 @@ class ShadingBoundary:
             past, side = outward != 0, dr.select(outward != 0, outward, 1)
             ray, pi, y, hidden, own = see(side, active)
             veiled = hidden & ~emission & is_veil(y) if self.veils else mi.Bool(False)
-            active &= veiled | (~hidden & (past | (own & (near > 0))))
-            shines = active & emission & (past | (near > 0))
+            active &= veiled | (~hidden & (past | (own & near_or_crossed)))
+            # Past all edges behind a veil, and past lines that move over their surface, both sides slide.
+            slide, shines = veiled | outline.crosses, active & emission & (past | near_or_crossed)
             L, from_lamp = self._emitted(tracer, point, y, ω, pdf, distance, shines, light, past & ~outline.is_line)
             valid = active & y.is_valid()
             again, lune, faces = sampler.clone(), None, mi.Spectrum(0)
@@ -313,21 +326,21 @@ class ShadingBoundary:
                 found = _found_from_points(point, p, y, ω, past & ~outline.is_line & ~veiled)
                 scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune, found)
                 L += dr.select(reflected, scattered, 0)
-            if tracer.scatters(2) or tracer.lamps is not None:
+            if tracer.scatters(2) or tracer.lamps is not None or self.crossed:
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
-                seen = see(-side, active & (veiled | ((near > 0) & ~outline.is_line)), slack=2)
+                seen = see(-side, active & (veiled | (near_or_crossed & ~outline.is_line)), slack=2)
                 other_L, of_faces = self._shown_by_faces(tracer, point, *seen, again, light, emission, lune, veiled)
-                # Past all edges behind a veil, both sides slide. Of lines, each is one of two that are looked at.
-                L = dr.select(veiled, (L - other_L) * dr.select(outline.is_line, mi.Float(0.5), 1), L)
+                active &= of_faces | veiled | ~slide
+                # Of lines in which shapes cut each other, each is one of two that are looked at.
+                L = dr.select(slide, (L - other_L) * dr.select(outline.is_line, mi.Float(0.5), 1), L)
                 # What its own faces show, held in its direction in the vicinity.
-                faces = dr.select(of_faces & ~veiled, other_L - dr.select(past, 0, L), 0)
-                faces = side * near * dr.select(active, f * faces, 0)
-            L, from_lamp = (dr.select(active & (past | veiled), f * light, 0) for light in (L, from_lamp))
+                of_faces &= active & ~slide
+                faces = side * near * dr.select(of_faces, f * (other_L - dr.select(past, 0, L)), 0)
+            L, from_lamp = (dr.select(active & (past | slide), f * light, 0) for light in (L, from_lamp))
             n_dl = dr.select(active, n_dl, 0)
 
         with dr.resume_grad():
-            p = self.silhouettes.point(placement, sample, dr.detach(x)).p
-            x = si.p + lift
+            p, x = self.silhouettes.point(placement, sample, x).p, si.p + lift
             edge = turning(n_dl, p - x, active)
             d = material_point(ray, pi, valid).p - x
             held = division.held_beside(d, ω, valid)

@@ -14,6 +14,9 @@ from .views import View
 #: Part of the length of a node that counts even where its moments promise no silhouette.
 FLOOR = 0.01
 
+#: Square of the sine of the angle from the axis of a cone below which rounding decides on which side a node is.
+ON_AXIS = 1e-8
+
 
 def importance(node: Node, view: View) -> mi.Float:
     """About what the boundaries among the edges of a node contribute; 0 only where they certainly contribute nothing.
@@ -67,8 +70,8 @@ def importance(node: Node, view: View) -> mi.Float:
         middle, extent = dr.dot(outwards, d), dr.dot(dr.abs(outwards), half)
         inside = dr.clip(0.5 - 0.5 * middle / extent, 0, 1)
         narrow2 = dr.square(cone.sin) * r2
-        # Where the cone has no axis at the node, or the node no extent, it is as good as inside.
-        certain = cone.everything | (off2 == 0) | (extent == 0)
+        # Where the node is on the axis, up to rounding, or has no extent, it is as good as inside.
+        certain = cone.everything | (off2 <= ON_AXIS * dr.squared_norm(d)) | (extent == 0)
         weight *= dr.select(certain, 1, inside * narrow2 / (narrow2 + size2 / 3))
     result = length * weight * dr.rcp(r2)
     return dr.select(possible & (length > 0) & dr.isfinite(result), result, 0)

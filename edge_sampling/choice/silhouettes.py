@@ -13,7 +13,7 @@ from rimlight.edge_sampling.geometry.curves import PIECES, Curves
 from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.grids import grids_of
-from rimlight.edge_sampling.geometry.meshes import Geometry
+from rimlight.edge_sampling.geometry.meshes import Geometry, inner
 
 from .edge_tree import EdgeTree
 from .sampling import EdgeSample, sample_edge
@@ -49,7 +49,7 @@ class OutlinePoint:
     is_line : is it on a line in which shapes cut through each other? Then both faces go on beyond it.
     slack : how far from p what is rendered may lie, scene units: 0 but for grids. concave : is it on an edge of a grid
         that is bent inwards?
-    slides : is it on a contour, which slides over its surface?
+    slides : is it on a contour, which slides over its surface? crosses : on a line of a texture that does?
     """
 
     p: mi.Point3f
@@ -59,6 +59,7 @@ class OutlinePoint:
     slides: mi.Bool
     slack: mi.Float
     concave: mi.Bool
+    crosses: mi.Bool
 
     @property
     def normals(self) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -105,31 +106,45 @@ class Silhouettes:
     edges : their edges, on the host.
     moving : see `Geometry.moving`. None: take all as moving.
     lamps : shapes whose borders with other shapes count from wherever they are seen: see `DividedLight`.
+    sliding : meshes over which the lines of their textures move: these count from wherever they are seen.
 
     Moving edges are a group of their own, so that viewers that stand still need not look at the others.
     """
 
-    _NUMBERS = ("count", "groups", "centre", "_first_line", "_still")
-    DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", "grids", *_NUMBERS))  # for `dr.freeze`
+    _NUMBERS = ("count", "groups", "centre", "_first_texture", "_first_line", "_still", "_crosses")
+    DRJIT_STRUCT = dict.fromkeys(("tree", "curves", "lines", "textures", "grids", *_NUMBERS))  # for `dr.freeze`
 
     def __init__(
-        self, geometry: Geometry, edges: Edges, moving: tuple[bool, ...] | None, lamps: Sequence[mi.Shape] = ()
+        self,
+        geometry: Geometry,
+        edges: Edges,
+        moving: tuple[bool, ...] | None,
+        lamps: Sequence[mi.Shape] = (),
+        sliding: Sequence[mi.Shape] = (),
     ):
         self.geometry = geometry
+        #: At which textures jump; they are the last edges but for `lines`.
+        self.textures = geometry.textures
         #: In which shapes cut through each other; they are the last edges.
         self.lines = geometry.lines
         #: What stands for their surfaces is among the edges.
         self.grids = grids_of(geometry)
         self.count = len(edges)
-        self._first_line = dr.opaque(mi.UInt32, self.count - int(edges.is_line.sum()))
+        first_line = self.count - int(edges.is_line.sum())
+        first_texture = first_line - (self.textures.capacity if self.textures is not None else 0)
+        self._first_texture, self._first_line = (dr.opaque(mi.UInt32, n) for n in (first_texture, first_line))
+        flags = lambda found: mi.Bool(found if len(found) else [False])  # Dr.Jit 1.5 cannot freeze empty arrays
+        crosses = (np.arange(self.count) >= first_texture) & ~edges.is_line & _are_of(geometry, edges, sliding)
+        self._crosses = flags(crosses)
         moves = np.ones(len(edges), bool)
         if moving is not None:
-            moves = edges.is_line | np.array(moving, bool)[edges.mesh].any(axis=1)
-        self._still = mi.Bool(~moves if len(moves) else [True])  # Dr.Jit 1.5 cannot freeze empty arrays
+            moves = edges.is_line | crosses | np.array(moving, bool)[edges.mesh].any(axis=1)
+        self._still = flags(~moves)
         groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
         #: Number of groups of edges.
         self.groups = len(groups)
-        self.tree = EdgeTree(geometry, edges, groups, _borders(geometry, edges, lamps)) if groups else None
+        always = _borders(geometry, edges, lamps) | crosses
+        self.tree = EdgeTree(geometry, edges, groups, always) if groups else None
         self.curves = Curves(geometry.analytic, geometry.joints) if geometry.analytic else None
         self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
 
@@ -139,8 +154,8 @@ class Silhouettes:
 
     @property
     def moving_edges(self) -> np.ndarray:
-        """Numbers of the edges that move, (M,), uint32, but for those in which shapes cut through each other."""
-        still = np.array(self._still)[: self._first_line[0]]
+        """Numbers of the edges that move, (M,), uint32, but for `textures` and `lines`."""
+        still = np.array(self._still)[: self._first_texture[0]]
         return np.flatnonzero(~still).astype(np.uint32)
 
     @property
@@ -241,7 +256,7 @@ class Silhouettes:
 
     def is_moving_edge(self, sample: EdgeSample) -> mi.Bool:
         """Is it on one of `moving_edges`?"""
-        on_edge = sample.edge < self._first_line
+        on_edge = sample.edge < self._first_texture
         return on_edge & ~dr.gather(mi.Bool, self._still, dr.select(on_edge, sample.edge, 0))
 
     def only_bends(self, sample: EdgeSample, outline: OutlinePoint) -> mi.Bool:
@@ -262,6 +277,10 @@ class Silhouettes:
         edge = dr.select(active, sample.edge, 0)
         edges = self.tree.device_edges
         farther = edges.farther(scene, placement.positions, edge, p, x - p) + edges.grids.slack(edge)
+        if self.textures is not None:
+            on_texture = (edge >= self._first_texture) & (edge < self._first_line)
+            piece = dr.select(on_texture, edge - self._first_texture, 0)
+            farther += dr.select(on_texture, self.textures.beside(placement.positions, piece), 0)
         return aside + dr.select(active, farther, 0)
 
     def point(
@@ -278,7 +297,8 @@ class Silhouettes:
                 inwards = tuple(dr.detach(o - p) for o in edges.opposite(placement.positions, index))
                 is_line = index >= self._first_line if self.lines else mi.Bool(False)
                 of_grid = edges.grids.slack(index), edges.is_concave(placement.positions, index)
-                point = OutlinePoint(p, dr.detach(b - a), inwards, is_line, mi.Bool(False), *of_grid)
+                crosses = dr.gather(mi.Bool, self._crosses, index) if self.textures is not None else mi.Bool(False)
+                point = OutlinePoint(p, dr.detach(b - a), inwards, is_line, mi.Bool(False), *of_grid, crosses)
             if edges.curves is not None:
                 curved, on_curve, tangent = edges.on_curve(placement.positions, index, sample.t)
                 point.p = dr.select(curved, on_curve, point.p)
@@ -291,20 +311,25 @@ class Silhouettes:
         c = self.curves.point(placement.frames, piece, sample.t, eye, far)
         # Where there is none, both sides seem to have a face.
         inwards = (c.inwards, dr.select(c.valid, c.other, -c.inwards))
-        on_curve = OutlinePoint(c.p, c.tangent, inwards, mi.Bool(False), c.slides, mi.Float(0), mi.Bool(False))
+        no = mi.Bool(False)
+        on_curve = OutlinePoint(c.p, c.tangent, inwards, no, c.slides, mi.Float(0), no, no)
         if self.tree is None:
             return on_curve
         choose = lambda x, y: dr.select(on_edge, x, y)
         inwards = tuple(choose(x, y) for x, y in zip(point.inwards, on_curve.inwards, strict=True))
         p, tangent = choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent)
         slack, concave = dr.select(on_edge, point.slack, 0), point.concave & on_edge
-        return OutlinePoint(p, tangent, inwards, point.is_line & on_edge, c.slides & ~on_edge, slack, concave)
+        is_line, crosses = point.is_line & on_edge, point.crosses & on_edge
+        return OutlinePoint(p, tangent, inwards, is_line, c.slides & ~on_edge, slack, concave, crosses)
 
 
-def _borders(geometry: Geometry, edges: Edges, lamps: Sequence[mi.Shape]) -> np.ndarray | None:
-    """Which edges are between a lamp and another mesh: (E,), bool; None if there are no lamps."""
-    if not lamps:
-        return None
-    known = {int(s.ptr) for s in lamps}
-    is_lamp = np.array([int(m.ptr) in known for m in geometry.meshes] or [False])
-    return is_lamp[edges.mesh].any(axis=1) & (edges.mesh[:, 0] != edges.mesh[:, 1])
+def _borders(geometry: Geometry, edges: Edges, lamps: Sequence[mi.Shape]) -> np.ndarray:
+    """Which edges are between a lamp and another mesh: (E,), bool."""
+    return _are_of(geometry, edges, lamps) & (edges.mesh[:, 0] != edges.mesh[:, 1])
+
+
+def _are_of(geometry: Geometry, edges: Edges, shapes: Sequence[mi.Shape]) -> np.ndarray:
+    """Which edges have a face of one of these shapes: (E,), bool."""
+    known = {int(s.ptr) for s in shapes}
+    are = np.array([int(inner(m).ptr) in known for m in geometry.meshes] or [False])
+    return are[edges.mesh].any(axis=1)

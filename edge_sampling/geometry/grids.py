@@ -260,7 +260,7 @@ def normals(geometry: Geometry) -> mi.Float:
         own = m.gradients() if is_grid(m) else dr.gather(mi.Float, known, start + dr.arange(mi.UInt32, count))
         parts.append(own)
         start += count
-    return dr.concat([*parts, dr.zeros(mi.Float, 3 * geometry.line_vertices)] if geometry.lines else parts)
+    return dr.concat([*parts, dr.zeros(mi.Float, 3 * geometry.line_vertices)] if geometry.line_vertices else parts)
 
 
 def slack_of(geometry: Geometry) -> np.ndarray:

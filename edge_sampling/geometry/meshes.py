@@ -39,6 +39,7 @@ class Geometry:
     lines : in which shapes cut through each other (`CutCurves`, `Intersections`), whose vertices then come after those
         of the meshes.
     joints : rims of analytic shapes that coincide (`Rims`).
+    textures : lines at which textures jump (`TextureEdges`), whose vertices come last; None: they are not asked for.
     """
 
     meshes: tuple[Any, ...]
@@ -46,6 +47,7 @@ class Geometry:
     others: tuple[Any, ...] = ()
     lines: tuple[Any, ...] = ()
     joints: tuple[Any, ...] = ()
+    textures: Any = None
 
     @staticmethod
     def of(scene: mi.Scene) -> Geometry:
@@ -56,9 +58,13 @@ class Geometry:
         return Geometry(meshes, analytic, tuple(s for s in shapes if id(s) not in known))
 
     @property
+    def _all_lines(self) -> tuple[Any, ...]:
+        return self.lines if self.textures is None else (*self.lines, self.textures)
+
+    @property
     def line_vertices(self) -> int:
-        """Number of the vertices of `lines`."""
-        return sum(lines.vertices for lines in self.lines)
+        """Number of the vertices of `lines` and `textures`."""
+        return sum(lines.vertices for lines in self._all_lines)
 
     def any_line(self, wanted: np.ndarray) -> bool:
         """Can one of the shapes for which `wanted` (bool, laid out as `moving`) holds have lines?"""
@@ -96,13 +102,11 @@ class Geometry:
     def positions(self) -> mi.Float:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
         of_meshes = [positions_of(m) for m in self.meshes]
-        if not self.lines:
-            return _concat(of_meshes)
-        return dr.concat([*of_meshes, *(dr.ravel(p) for lines in self.lines for p in lines.points(of_meshes))])
+        return _concat([*of_meshes, *(dr.ravel(p) for lines in self._all_lines for p in lines.points(of_meshes))])
 
     def host_positions(self) -> np.ndarray:
         """Vertex positions of all meshes: (V, 3), world space, on the host."""
-        if self.lines:
+        if self._all_lines:
             with dr.suspend_grad():
                 return np.array(self.positions()).reshape(-1, 3)
         return np.concatenate([vertices(m) for m in self.meshes]) if self.meshes else np.zeros((0, 3), np.float32)
@@ -111,7 +115,7 @@ class Geometry:
         """Vertex normals of all meshes, laid out as `positions`; zero where a mesh has none. Attached."""
         none = lambda count: dr.zeros(mi.Float, 3 * count)
         normals = [normals_of(m) if has_interpolated_normals(m) else none(m.vertex_count()) for m in self.meshes]
-        return _concat([*normals, none(self.line_vertices)] if self.lines else normals)
+        return _concat([*normals, none(self.line_vertices)] if self._all_lines else normals)
 
 
 # ---------------------- Arrays, in both interfaces; attached where those of the mesh are ----------------------

@@ -97,7 +97,7 @@ class TextureLines:
     def __init__(self, shapes: Sequence[Any], lights: Sequence[mi.Emitter] = (), lit: Sequence[Any] | None = None):
         # Of each shape, lattices last, since the last line counts where several are found: the slopes of bump maps jump
         # there, and so may whether they turn away.
-        of_shapes = [(s, [*mapped_horizons(s), *_lattices(s)]) for s in shapes]
+        of_shapes = [(s, [*mapped_horizons(s), *lattices(s)]) for s in shapes]
         # The border of a beam counts where the texture of the light jumps as well.
         of_lights = [kind for light in lights for kind in lines_of_beam(light)]
         self.kinds = [kind for _, kinds in of_shapes for kind in kinds] + of_lights
@@ -175,10 +175,10 @@ def _is_one_of(si: mi.SurfaceInteraction3f, shapes: Sequence[Any]) -> mi.Bool:
 def lines_of_beam(light: mi.Emitter) -> list[Any]:
     """Where the light of a spot or a projector jumps."""
     border = [BeamBorder(light)] if has_hard_beam(light) else []
-    return [*_lattices(light, light), *border] if light.class_name() in BEAMS else []
+    return [*lattices(light, light), *border] if light.class_name() in BEAMS else []
 
 
-def _lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
+def lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
     """Of the textures of a shape, or of a light, that jump."""
     of_mesh = isinstance(shape, mi.Mesh) and has_texcoords(shape)
     uv = texture_coordinates(shape) if of_mesh else np.zeros((0, 2))

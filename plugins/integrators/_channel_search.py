@@ -47,7 +47,8 @@ class ChannelSearch(BoundarySearch):
         if on_film.any():
             # Where normals of faces are shown, edges of smooth-shaded meshes count, in proportion to their bend.
             which = {"soft": "geo_normal" in self.kinds, "seams": "uv" in self.kinds}
-            film = FilmBoundary(self.geometry, self._jumping(self._edges_and_lines), on_film, NoLights(), **which)
+            edges = self._jumping(self._edges_of(self.geometry))
+            film = FilmBoundary(self.geometry, edges, on_film, NoLights(), **which)
             film = film if any(film.outlines.counts) else None
         limits = (*outlines(scene, self.geometry, self._cracks, moving), *self._lasting_limits(scene))
         return Boundaries(film, None, None, None, None, moving.flags, moving.camera, moving.lights, limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,6 @@ from rimlight._plan import names
 from rimlight.edge_sampling import (
     Cracks,
     Geometry,
-    TextureLines,
     jumping_textures,
     maps_in_steps,
     objects_below,
@@ -23,7 +23,8 @@ from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others
-from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP
+from rimlight.edge_sampling.geometry.texture_edges import MOST
+from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP, lattices
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
@@ -92,13 +93,14 @@ def lasting_limits(
     cracks: Cracks,
     depths: Depths,
     moving: Moving,
+    lined: Sequence[mi.Shape],
     sppi: int,
     *,
     planes: bool,
     from_points: bool,
 ) -> tuple[str, ...]:
-    """What the derivative will lack as long as the edges stay what they are. planes, from_points : see
-    `BoundarySearch`."""
+    """What the derivative will lack as long as the edges stay what they are. lined : see
+    `appearance`. planes, from_points : see `BoundarySearch`."""
     limits = []
     if sppi:
         limits += reflected_light(scene, geometry, depths, from_points=from_points)
@@ -108,7 +110,7 @@ def lasting_limits(
             limits += [] if planes else coarse_meshes(scene)
     return (
         *limits,
-        *appearance(scene, depths, moving, bisects=from_points),
+        *appearance(scene, depths, moving, lined, bisects=from_points),
         *outlines(scene, geometry, cracks, moving),
     )
 
@@ -151,20 +153,7 @@ def veils(scene: mi.Scene, *, from_points: bool) -> list[str]:
             "the derivative lacks part of the motion of what is seen, and of what shines, through "
             f'{", ".join(names(through))}; cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
         ]
-    jump = [s for s in surfaces(scene) if through and len(TextureLines([s]))]
-    beyond = lambda s: names(v for v in through if v is not s or not is_flat(v))
-    limits = [
-        f"the derivative lacks the jumps of the textures of {names([s])[0]} where surfaces reflect them that see them "
-        f"through {', '.join(beyond(s))}; use bilinear bitmaps."
-        for s in jump
-        if beyond(s)
-    ]
-    close = names(s for s in jump if s in through)
-    if close:
-        limits.append(
-            f"the derivative lacks the jumps of {', '.join(close)} in the light that arrives through them at what is "
-            "close to them and moves past them; use bilinear bitmaps for their opacity."
-        )
+    limits = []
     coarse = names(s for s in surfaces(scene) if (s not in through or not is_flat(s)) and fringe(s) > FRINGE)
     if coarse and through:
         limits.append(
@@ -201,8 +190,11 @@ def shut_in_lamps(scene: mi.Scene, moving: Moving) -> list[str]:
     ]
 
 
-def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool) -> list[str]:
-    """What lacks of the jumps inside of surfaces and environments. bisects : are the lines of textures found?"""
+def appearance(
+    scene: mi.Scene, depths: Depths, moving: Moving, lined: Sequence[mi.Shape], *, bisects: bool
+) -> list[str]:
+    """What lacks of the jumps inside of surfaces and environments. bisects : are the lines of textures found? lined :
+    on which shapes points see them."""
     limits = []
     beams = [e for e in scene.emitters() if e.class_name() in BEAMS] if bisects else []
     textures = jumping_textures(scene, besides=(*surfaces(scene), *beams) if bisects else ())
@@ -222,12 +214,20 @@ def appearance(scene: mi.Scene, depths: Depths, moving: Moving, *, bisects: bool
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
             f"{', '.join(mapped)} turn away from what they light."
         )
-    slid = [s for s in moving.sliding if depths.scatters(2) or (s.is_emitter() and depths.scatters(1))]
-    slid = names(s for s in slid if bisects and len(TextureLines([s])))
-    if slid:
+    unknown = names(s for s in surfaces(scene) if moving.anything and s not in lined and lattices(s))
+    if unknown and bisects and depths.scatters(2):
         limits.append(
-            f"the derivative lacks, in the light that {', '.join(slid)} throw on other surfaces, the jumps of their "
-            "textures, whose coordinates change; use bilinear bitmaps."
+            f"the derivative lacks, in the light that {', '.join(unknown)} throw on surfaces close to them, the jumps "
+            "of their textures; use bilinear bitmaps, or meshes with texture coordinates, of less than "
+            f"{MOST} triangles times lines."
+        )
+    lamps = names(
+        s for s in moving.sliding if s.is_emitter() and s.emitter().flags() & mi.EmitterFlags.SpatiallyVarying
+    )
+    if lamps:
+        limits.append(
+            f"Mitsuba goes on to look for the light of {', '.join(lamps)} by the texture coordinates that they had at "
+            "first: load the scene anew after each step, or set the sampling_weight of these lamps to 0."
         )
     mirrors = [s for s in surfaces(scene) if is_mirror(s)] if depths.scatters(1) else []
     stepped = maps_in_steps([*moving.with_lines, *(mirrors if moving.anything else ())])
@@ -267,6 +267,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
         limits.append(
             f"the derivative is off by up to a tenth in parts of the shading of {', '.join(shaded)} (sdfgrid), in "
             "lights without a size, at the shadow that it throws on itself."
+        )
+    shiny = names(g.inner for g in grids_of(geometry) if g in moving.on_film and is_mirror(g.inner))
+    if shiny:
+        limits.append(
+            f"the derivative is noisy, and off by up to a fifth, in what {', '.join(shiny)} (sdfgrid) show, perfect "
+            "mirrors or glass that move. Give them a roughness, or replace them by meshes."
         )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:

@@ -45,6 +45,7 @@ from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mappe
 from rimlight.edge_sampling.geometry.meshes import inner, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
+from rimlight.edge_sampling.geometry.texture_edges import TextureEdges
 from rimlight.edge_sampling.parametrisation import Slides, slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
@@ -85,6 +86,7 @@ class BoundarySearch:
         self._curves: CutCurves | None = None
         self._rims: Rims | None = None
         self._lines: Intersections | None = None
+        self._textures: TextureEdges | None = None
         self._sources: Sources | None = None
         self._checked = False
         self._partial: PartialParameters | None = None
@@ -147,7 +149,7 @@ class BoundarySearch:
         self._refuse_while_recording()
         refuse_timed_sky(scene, self.who)
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
-        self.geometry = self.edges = self._curves = self._rims = self._lines = None
+        self.geometry = self.edges = self._curves = self._rims = self._lines = self._textures = None
         self._sources = self._partial = self._media = None
         self._boundaries, self._beyond, self._maps, self._bent = {}, {}, [], []
         collect_before()
@@ -155,6 +157,7 @@ class BoundarySearch:
         self.edges, weld = find_welded_edges(geometry)
         self._curves, self._rims = CutCurves(geometry), Rims(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
+        self._textures = TextureEdges(geometry)
         self.edges, self._cracks = close_cracks(geometry, self.edges, weld)
         self._sources = Sources(scene, found, geometry, self.edges, weld, self._cracks)
         self._partial, self._media = PartialParameters(scene), Media(scene)
@@ -163,17 +166,20 @@ class BoundarySearch:
 
     def _find_lines(self, scene: mi.Scene) -> None:
         """Find the lines in which the shapes cut through each other now, and the rims that coincide."""
-        changed = self._curves.find(self.geometry), self._lines.find(scene, self.geometry), self._rims.find()
+        cut = self._curves.find(self.geometry), self._lines.find(scene, self.geometry)
+        changed = *cut, self._rims.find(), self.from_points and self._textures.find()
         if any(changed):
             lines = tuple(lines for lines in (self._curves, self._lines) if lines.capacity)
             self.geometry = replace(self.geometry, lines=lines, joints=self._rims.joints)
             self._boundaries = {}
             collect_before()
 
-    @property
-    def _edges_and_lines(self) -> Edges:
-        edges, count = self.edges, sum(m.vertex_count() for m in self.geometry.meshes)
-        for lines in self.geometry.lines:
+    def _edges_of(self, geometry: Geometry) -> Edges:
+        """All edges, in the order that `Silhouettes` wants."""
+        edges, count = self.edges, sum(m.vertex_count() for m in geometry.meshes)
+        if geometry.textures is not None:
+            edges += geometry.textures.as_edges(count + sum(lines.vertices for lines in geometry.lines))
+        for lines in geometry.lines:
             edges, count = lines.as_edges(edges, count), count + lines.vertices
         return edges
 
@@ -233,7 +239,7 @@ class BoundarySearch:
         on_film = np.array([m or moving.camera for m in moving.flags], bool)
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
         soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
-        edges = self._edges_and_lines
+        edges = self._edges_of(self.geometry)
         turning, sppi = np.array(moving.turning, bool), sppi if moving.in_space else 0
         film = None
         if on_film.any() or turning.any():
@@ -241,11 +247,12 @@ class BoundarySearch:
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi)
+        lined = self._textures.shapes if self.from_points else ()
         abilities = {"planes": self.planes, "from_points": self.from_points}
         deep = None
         if shading is not None and self.from_surfaces and self.depths.scatters(3):
             deep = DeepShadows(scene, shading.silhouettes)
-        limits = lasting_limits(scene, self.geometry, self._cracks, self.depths, moving, sppi, **abilities)
+        limits = lasting_limits(scene, self.geometry, self._cracks, self.depths, moving, lined, sppi, **abilities)
         glass = self.from_points and self.depths.scatters(2) and not self.geometry.others
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         slides = Slides.BEHIND_GLASS if glass else Slides.NOTHING
@@ -292,12 +299,16 @@ class BoundarySearch:
         turning = None if self.depths.scatters(2) else shapes  # what a surface that moves lights may stand still
         lamps = DividedLight.of(scene, turning) if self.from_points and not self.geometry.others else None
         flags, divided = None if everything else moving.flags, lamps.shapes if lamps is not None else ()
-        silhouettes = Silhouettes(self.geometry, self._edges_and_lines, flags, divided)
+        # Lines of textures move as surfaces see them: close by, or where texture coordinates change.
+        jump = self.depths.scatters(2) or any(s.is_emitter() for s in moving.sliding)
+        textures = self._textures if jump and self._textures.capacity else None
+        geometry = replace(self.geometry, textures=textures)
+        silhouettes = Silhouettes(geometry, self._edges_of(geometry), flags, divided, moving.sliding)
         if not len(silhouettes):
             return None, None, (), None
         shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, ()
         if self.from_points:
-            shading = ShadingBoundary(scene, silhouettes, shapes)
+            shading = ShadingBoundary(scene, silhouettes, shapes, moving.sliding)
             needed = self.depths.scatters(2) or shading.emission_at_first or lamps is not None
             shading = shading if needed else None
             kinds = (IndirectShadows, IndirectBeams) if self.depths.scatters(2) else ()

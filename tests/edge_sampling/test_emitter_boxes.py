@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from rimlight.checks import Motion, derivative_image
-from rimlight.edge_sampling import Geometry
+from rimlight.edge_sampling import EdgeTree, Geometry, View, find_edges
 from rimlight.edge_sampling.choice.emitter_boxes import EmitterBoxes
+from rimlight.edge_sampling.choice.importance import importance
 
 LIGHTS = {
     "quad": lambda: cases.horizontal((0.3, 2, 0.1), 0.4, "light", down=True, emitter=cases.light(1, 1, 1)),
@@ -57,6 +58,19 @@ def test_no_direction_to_a_light_is_missing(light, x):
 def test_cones_are_tight():
     _, sin = inside(scene_with(LIGHTS["tiny"]()), [0.3, 0, 0.1])
     assert sin == pytest.approx(1e-4 * np.sqrt(2) / 2, rel=0.05)
+
+
+def test_edges_on_the_axis_of_a_cone_count():
+    """The box around the edges of a lamp is its own: from nowhere it may seem to lie beside its cone."""
+    scene = scene_with(LIGHTS["quad"]())
+    geometry = Geometry((next(s for s in scene.shapes() if s.is_emitter()),))
+    tree = EdgeTree(geometry, find_edges(geometry), [np.arange(5)])
+    tree.refit(geometry.positions())
+    x, z = dr.meshgrid(dr.linspace(mi.Float, -2, 2, 64), dr.linspace(mi.Float, -2, 2, 64))
+    p = mi.Point3f(x, 0, z)
+    cone = boxes_of(scene).cone(mi.UInt32(next(i for i, e in enumerate(scene.emitters()) if e.get_shape())), p)
+    view = View(mi.Vector3f(p - tree.centre), mi.Vector3f(0), mi.Float(1), [], cone)
+    assert dr.all(importance(tree.node(tree.device_node_offsets[0] + 1), view) > 0)
 
 
 def test_cones_follow_the_vertices():

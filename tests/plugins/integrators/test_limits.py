@@ -5,9 +5,11 @@ from __future__ import annotations
 import as_written
 import cases
 import drjit as dr
+import grids
 import mitsuba as mi
 import numpy as np
 import pytest
+import sliding_textures
 from random_scenes import ball
 
 from rimlight.edge_sampling.geometry import texture_lines
@@ -314,10 +316,32 @@ def test_lamps_that_move_in_smooth_bulbs_are_warned_about(kind, glass, place, ke
 # ---------------------- Textures that slide ----------------------
 
 
-@pytest.mark.parametrize(
-    ("kind", "options", "missing"), [("direct_edge", {}, False), ("prb_edge", {"max_depth": 3}, True)]
-)
-def test_textures_that_slide_in_indirect_light(kind, options, missing):
-    messages = said(as_written.checkered_board(), "board.vertex_texcoords", kind=kind, **options)
+@pytest.mark.parametrize(("bsdf", "missing"), [("conductor", 1), ("dielectric", 1), ("roughconductor", 0)])
+def test_grids_that_are_mirrors_or_glass(bsdf, missing):
+    thing = {"type": "sdfgrid", "grid": grids.grid(n=8)["grid"], "bsdf": {"type": bsdf}}
+    scene = cases.scene(sensor=cases.camera(), thing=thing, sky=cases.constant())
+    messages = said(scene, "thing.to_world", kind="prb_edge", max_depth=3)
+    assert sum('in what "thing" (sdfgrid) show' in m for m in messages) == missing
+
+
+def checkered(shape: str) -> dict:
+    return {"type": shape, "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
+
+
+@pytest.mark.parametrize(("shape", "depth", "missing"), [("disk", 3, 1), ("disk", 2, 0), ("rectangle", 3, 0)])
+def test_lines_of_textures_that_points_do_not_see(shape, depth, missing):
+    scene = cases.scene(sensor=cases.camera(), thing=checkered(shape), sky=cases.constant())
+    messages = said(scene, "thing.to_world", kind="prb_edge", max_depth=depth)
     assert len(messages) == missing
-    assert all('in the light that "board" throw on other surfaces, the jumps of their textures' in m for m in messages)
+    assert all('in the light that "thing" throw on surfaces close to them, the jumps' in m for m in messages)
+
+
+def test_textures_that_slide():
+    scene = as_written.checkered_board()
+    assert not said(scene, "board.vertex_texcoords", kind="prb_edge", max_depth=3)
+
+
+def test_lamps_whose_textures_slide():
+    make, motion, *_ = sliding_textures.SLIDING["lamp_slides"]
+    (message,) = said(make(), motion["key"], kind="direct_edge")
+    assert 'Mitsuba goes on to look for the light of "lamp"' in message

@@ -807,9 +807,6 @@ MESSAGES = {
     "`sunsky`": [in_lamp("sunsky", "border of the sun")],
     "`timed_sunsky`": [in_lamp("timed", TIMED)],
     "`volume` that shows a `gridvolume`, `nearest`": [material(lambda: volume("nearest"), "jumps of the textures")],
-    "`mask` whose opacity jumps, in `prb_edge`": [
-        material(lambda: leaves.mask(leaves.opacity("nearest", 0, 1)), 'lacks the jumps of "thing" in', deep=True)
-    ],
 }
 #: By row, what changes, and is warned about.
 CHANGES = {
@@ -842,9 +839,8 @@ ELSEWHERE = {
     "`batch` of the above": ["batch_cube", "batch_camera"],
     "`mask` in `prb_edge`": [
         "veil_glow", "veil_cube", "veil_camera", "veil_opacity", "leaf_moves", "behind_veil_point",
-        "behind_veil_checkers",
+        "behind_veil_checkers", "leaf_shadow", "leaf_turns", "veil_turns",
     ],
-    "`mask` whose opacity jumps, in `prb_edge`": ["leaf_shadow"],
     "`null` in `prb_edge`": ["null_glow"],
     "`polarizer`, `retarder`, `circular` in `prb_edge`": [test_what_is_seen_through_polarisers],
     "`thindielectric`": [test_thin_glass_changes],
