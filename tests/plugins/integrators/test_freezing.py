@@ -248,7 +248,7 @@ def test_all_that_is_read_is_known_to_frozen_functions():
         (film.outlines.edges, set()),
         (boundaries.shadows, set()),
         (boundaries.shadows.lights, set()),
-        (shading, {"geometry", "cut_lamps"}),
+        (shading, {"geometry", "cut_lamps", "crossed_lamps"}),
         (shading.from_edges, set()),
         (shading.silhouettes, {"geometry"}),
         (shading.silhouettes.tree, {"geometry", "node_offsets", "leaf_offsets", "_recorded"}),
