@@ -370,6 +370,21 @@ MUTANTS = [
         "(faces * (edge - turned) - side",
         "(-side",
     ),
+    mutant(
+        "lines of textures: they do not follow texture coordinates",
+        "edge_sampling/geometry/texture_edges.py",
+        "[texcoords_of(inner(m)) if i",
+        "[dr.detach(texcoords_of(inner(m))) if i",
+    ),
+    mutant(
+        "lines of textures: only what is held in its direction counts", SHADING, "veiled | outline.crosses,", "veiled,"
+    ),
+    mutant(
+        "edges from points: what is on the axis of a lamp's cone may be beside it",
+        "edge_sampling/choice/importance.py",
+        "off2 <= ON_AXIS * dr.squared_norm(d)",
+        "off2 == 0",
+    ),
     # ---------------------- Channels besides light ----------------------
     mutant(
         "channels: what a ray meets follows the surface",

@@ -60,9 +60,9 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     **Memory.** As with ``direct_edge``, many samples are taken in passes.
 
     **Limits.** Those of ``direct_edge``, but for interreflections. Missing, with a warning, are outlines in the light
-    that perfect mirrors and glass throw on other surfaces, and textures that jump, where surfaces reflect them that see
-    them through masks. With ``max_depth`` above 32 or -1, the vertices of paths are counted before they are written
-    down, which ``dr.freeze`` cannot record in a derivative.
+    that perfect mirrors and glass throw on other surfaces, and textures that jump on spheres, disks and cylinders, in
+    the light that these throw on surfaces close to them. With ``max_depth`` above 32 or -1, the vertices of paths are
+    counted before they are written down, which ``dr.freeze`` cannot record in a derivative.
 
     .. tabs::
         .. code-tab:: xml
