@@ -226,7 +226,7 @@ def test_several_data_sets_on_workers(folder, result, tmp_path, capfd):
     arguments = ["ps", "run", str(folder), str(tmp_path / "empty"), "--out", str(tmp_path / "out"), *QUICK, *one]
     assert main([*arguments, "--brightness", "0", "--workers", "1"]) == 2
     said = capfd.readouterr().out.splitlines()
-    assert said[0].startswith("bowl: finished: ") and said[-1].startswith("empty: ps: there is no file")
+    assert said[0].startswith("bowl: finished: ") and said[-1].startswith("empty: ps: there are no pictures in")
     both = [json.loads((out / "metadata.json").read_text()) for out in (result[0], tmp_path / "out" / "bowl")]
     assert both[0]["status"] == both[1]["status"] == "finished"
     normals = [read_exr(out / "normals.exr")[0][""] for out in (result[0], tmp_path / "out" / "bowl")]
