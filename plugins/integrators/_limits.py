@@ -108,6 +108,8 @@ def lasting_limits(
         if depths.scatters(1):
             limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
+        if depths.scatters(2) and from_points:
+            limits += coarse_reflectors(scene)
     return (
         *limits,
         *appearance(scene, depths, moving, lined, bisects=from_points),
@@ -416,8 +418,22 @@ def coarse_meshes(scene: mi.Scene) -> list[str]:
     ]
 
 
+def coarse_reflectors(scene: mi.Scene) -> list[str]:
+    """What the derivative lacks of indirect light: surfaces see where interpolated normals turn away from them, too."""
+    coarse = names(s for s in surfaces(scene) if not s.is_emitter() and fringe(s) > TURNED)
+    if not coarse:
+        return []
+    return [
+        f"the light that {', '.join(coarse)} reflects to other surfaces is off by some per cent: where interpolated "
+        "normals turn away from these surfaces, the light jumps. Give it a finer mesh or face normals."
+    ]
+
+
 #: How far the cosine between the normals of faces and vertices may be below 1, without a warning.
 FRINGE = 0.005
+
+#: The same, of what reflects light to other surfaces.
+TURNED = 0.1
 
 
 def distant_scene(scene: mi.Scene) -> list[str]:
