@@ -140,7 +140,10 @@ class Silhouettes:
         if moving is not None:
             moves = edges.is_line | crosses | np.array(moving, bool)[edges.mesh].any(axis=1)
         self._still = flags(~moves)
-        groups = [np.flatnonzero(m) for m in (moves, ~moves) if m.any()]
+        counts = np.ones(len(edges), bool)
+        if self.textures is not None:
+            counts[first_texture:first_line] = ~self.textures.fine | crosses[first_texture:first_line]
+        groups = [np.flatnonzero(m) for m in (moves & counts, ~moves & counts) if m.any()]
         #: Number of groups of edges.
         self.groups = len(groups)
         always = _borders(geometry, edges, lamps) | crosses

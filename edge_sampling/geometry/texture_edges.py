@@ -7,6 +7,8 @@ A line moves with its triangle, and over it, if the texture coordinates change. 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -22,6 +24,10 @@ VERTICES = 4
 #: Most pieces of one mesh. A finer texture is left out.
 MOST = 2**17
 
+#: Most lines across a mesh, in one direction, that count where they rest on their surface. More of them light others as
+#: their mean does, and to sample them one by one would be noisy.
+COARSE = 8
+
 #: How far beside a line to look, in units in the last place of the coordinate that is whole there.
 BESIDE_TEXTURE = 64
 
@@ -34,18 +40,21 @@ class TextureEdges:
     not needed has the length 0.
 
     geometry : the meshes. Those whose textures are too fine are left out.
+    every : do fine textures count, too, that rest on their surface?
     """
 
     DRJIT_STRUCT = dict.fromkeys(("_corners", "_rows", "_sizes"))  # for `dr.freeze`
 
-    def __init__(self, geometry: Geometry):
-        self._meshes, self._left_out = geometry.meshes, set()
+    def __init__(self, geometry: Geometry, *, every: bool):
+        self._meshes, self._left_out, self._every = geometry.meshes, set(), every
         self._lattices = {
             i: found
             for i, m in enumerate(self._meshes)
             if not is_grid(m) and has_texcoords(inner(m)) and (found := lattices(inner(m)))
         }
         self.capacities = dict.fromkeys(self._lattices, 0)
+        #: Most lines across each mesh, in one direction.
+        self._across = dict.fromkeys(self._lattices, 0)
         self._at: dict[int, mi.Float] = {}
         self._pieces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         #: Of each piece: the corners of its triangle, among all vertices; the coefficients of u, v, and 1 in the
@@ -54,10 +63,18 @@ class TextureEdges:
         self._rows: list[mi.Float] = []
         self._sizes = mi.Float(1)
 
+    def shapes(self, sliding: Sequence[mi.Shape]) -> list[mi.Shape]:
+        """Those whose lines count. sliding : those over which they move."""
+        known = {i: inner(self._meshes[i]) for i in self._lattices if i not in self._left_out}
+        return [s for i, s in known.items() if not self._is_fine(i) or s in sliding]
+
+    def _is_fine(self, i: int) -> bool:
+        return not self._every and self._across[i] > COARSE
+
     @property
-    def shapes(self) -> list[mi.Shape]:
-        """Those whose lines are among them."""
-        return [inner(self._meshes[i]) for i in self._lattices if i not in self._left_out]
+    def fine(self) -> np.ndarray:
+        """Which pieces count only if they move over their surface: (capacity,), bool."""
+        return np.repeat([self._is_fine(i) for i in self.capacities], list(self.capacities.values()))
 
     @property
     def capacity(self) -> int:
@@ -102,12 +119,14 @@ class TextureEdges:
         mesh = inner(self._meshes[i])
         face, uv = faces(mesh).astype(np.int64), texture_coordinates(mesh).astype(np.float64)
         self._left_out.discard(i)
+        self._across[i] = 0
         inside = _edges_inside(np.concatenate([vertices(mesh), uv], 1), face)
         which, rows = [np.zeros(0, np.int64)], [np.zeros((0, 4))]
         for lattice in self._lattices[i]:
             for row in lattice.matrix:
                 at = uv @ row[:2] + row[2]
                 size = np.maximum(lattice.size, np.abs(at))
+                self._across[i] = max(self._across[i], np.floor(at.max()) - np.floor(at.min()))
                 at = np.where(np.abs(at - np.round(at)) <= ON_LINE * EPSILON * size, np.round(at), at)[face]
                 # A line along an edge belongs to the face below it.
                 lower, upper = np.floor(at.min(1)), np.floor(at.max(1))

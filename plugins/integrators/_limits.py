@@ -23,11 +23,13 @@ from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others
-from rimlight.edge_sampling.geometry.texture_edges import MOST
+from rimlight.edge_sampling.geometry.texture_edges import COARSE
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP, lattices
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
+
+from ._coarse_limits import FRINGE, coarse_lamps, coarse_meshes, coarse_reflectors
 
 #: What perfect mirrors and glass do.
 MIRRORS = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
@@ -220,8 +222,8 @@ def appearance(
     if unknown and bisects and depths.scatters(2):
         limits.append(
             f"the derivative lacks, in the light that {', '.join(unknown)} throw on surfaces close to them, the jumps "
-            "of their textures; use bilinear bitmaps, or meshes with texture coordinates, of less than "
-            f"{MOST} triangles times lines."
+            "of their textures, which matter little if they are fine; use bilinear bitmaps, or meshes with texture "
+            f"coordinates and at most {COARSE} lines across."
         )
     lamps = names(
         s for s in moving.sliding if s.is_emitter() and s.emitter().flags() & mi.EmitterFlags.SpatiallyVarying
@@ -391,49 +393,6 @@ def refuse_timed_sky(scene: mi.Scene, who: str) -> None:
         raise Refusal(
             f"{who}: Mitsuba cannot sample {', '.join(timed)} (timed_sunsky) in symbolic loops. Replace it by sunsky."
         )
-
-
-def coarse_lamps(scene: mi.Scene) -> list[str]:
-    """What the derivative lacks of the light that smooth-shaded meshes throw: Mitsuba reckons it with interpolated
-    normals, but faces turn away one after the other, each while its light is not yet 0."""
-    shapes = [e.get_shape() for e in scene.emitters() if e.get_shape() is not None]
-    return [
-        f"where the light of {names([s])[0]} falls, the derivative is off by up to about {100 * fringe(s):.1g} %, "
-        "since Mitsuba shades the faces of its coarse mesh with interpolated normals. Give it a finer mesh or face "
-        "normals."
-        for s in shapes
-        if fringe(s) > FRINGE
-    ]
-
-
-def coarse_meshes(scene: mi.Scene) -> list[str]:
-    """What a derivative without `FacePlanes` lacks: the faces of smooth-shaded meshes hide light from themselves."""
-    sized = [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Delta and not hasattr(e, "light_count")]
-    coarse = names(s for s in surfaces(scene) if fringe(s) > FRINGE) if sized else []
-    if not coarse:
-        return []
-    return [
-        f"the derivative lacks what the faces of {', '.join(coarse)} hide of lamps with a size, while interpolated "
-        "normals go on being lit. Give them finer meshes or face normals, or use direct_edge or prb_edge."
-    ]
-
-
-def coarse_reflectors(scene: mi.Scene) -> list[str]:
-    """What the derivative lacks of indirect light: surfaces see where interpolated normals turn away from them, too."""
-    coarse = names(s for s in surfaces(scene) if not s.is_emitter() and fringe(s) > TURNED)
-    if not coarse:
-        return []
-    return [
-        f"the light that {', '.join(coarse)} reflects to other surfaces is off by some per cent: where interpolated "
-        "normals turn away from these surfaces, the light jumps. Give it a finer mesh or face normals."
-    ]
-
-
-#: How far the cosine between the normals of faces and vertices may be below 1, without a warning.
-FRINGE = 0.005
-
-#: The same, of what reflects light to other surfaces.
-TURNED = 0.1
 
 
 def distant_scene(scene: mi.Scene) -> list[str]:

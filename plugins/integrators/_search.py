@@ -157,7 +157,7 @@ class BoundarySearch:
         self.edges, weld = find_welded_edges(geometry)
         self._curves, self._rims = CutCurves(geometry), Rims(geometry)
         self._lines = Intersections(scene, geometry, self.edges, weld)
-        self._textures = TextureEdges(geometry)
+        self._textures = TextureEdges(geometry, every=has_veils(scene))
         self.edges, self._cracks = close_cracks(geometry, self.edges, weld)
         self._sources = Sources(scene, found, geometry, self.edges, weld, self._cracks)
         self._partial, self._media = PartialParameters(scene), Media(scene)
@@ -247,7 +247,7 @@ class BoundarySearch:
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi)
-        lined = self._textures.shapes if self.from_points else ()
+        lined = self._textures.shapes(moving.sliding) if self.from_points else ()
         abilities = {"planes": self.planes, "from_points": self.from_points}
         deep = None
         if shading is not None and self.from_surfaces and self.depths.scatters(3):

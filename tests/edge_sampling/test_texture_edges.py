@@ -34,7 +34,7 @@ def board(reflectance: dict | None = None, width: float = 0.9, seam: float = 0.0
 
 def length(mesh: mi.Mesh) -> float:
     """Of all pieces together."""
-    edges = TextureEdges(Geometry((mesh,)))
+    edges = TextureEdges(Geometry((mesh,)), every=False)
     assert edges.find()
     assert not edges.find()
     a, b, *_ = edges.points([dr.detach(mesh.vertex_positions_buffer())])
@@ -69,7 +69,7 @@ def test_each_line_counts_once(mesh, lines):
 def test_they_follow_texture_coordinates():
     """A line u = 1/2 at x = 2 · 0.5 / 0.9 moves by −2 / 0.9 times the change of u."""
     mesh = board()
-    edges, params = TextureEdges(Geometry((mesh,))), mi.traverse(mesh)
+    edges, params = TextureEdges(Geometry((mesh,)), every=False), mi.traverse(mesh)
     edges.find()
     θ = mi.Float(0)
     dr.enable_grad(θ)
@@ -84,7 +84,7 @@ def test_they_follow_texture_coordinates():
 
 def test_more_of_them_need_more_space():
     mesh = board()
-    edges, params = TextureEdges(Geometry((mesh,))), mi.traverse(mesh)
+    edges, params = TextureEdges(Geometry((mesh,)), every=False), mi.traverse(mesh)
     edges.find()
     for scale, more in ((1.05, False), (8, True), (0.1, False)):
         params["vertex_texcoords"] = mi.Float(np.ravel([[0.9 * scale * x / 2, 0.1] for x, *_ in corners_of(mesh)]))
@@ -100,6 +100,16 @@ def corners_of(mesh):
 def test_what_is_too_fine_is_left_out(monkeypatch):
     monkeypatch.setattr(texture_edges, "MOST", 5)
     mesh = board(checkers(3))
-    edges = TextureEdges(Geometry((mesh,)))
+    edges = TextureEdges(Geometry((mesh,)), every=False)
     assert not edges.find()
-    assert not edges.shapes
+    assert not edges.shapes([])
+
+
+@pytest.mark.parametrize(("columns", "fine"), [(4.5, False), (9.0, True)])
+def test_fine_textures_count_where_they_move_over_their_surface(columns, fine):
+    mesh = board(checkers(columns))
+    for every in (False, True):
+        edges = TextureEdges(Geometry((mesh,)), every=every)
+        edges.find()
+        assert (edges.fine == (fine and not every)).all() and len(edges.fine) == edges.capacity > 0
+        assert edges.shapes([mesh]) == [mesh] and edges.shapes([]) == [mesh] * (every or not fine)

@@ -206,7 +206,7 @@ def test_indirect_light_of_coarse_meshes(coarse, max_depth, warns):
     floor = cases.horizontal((0, -0.3, 0), 2, "floor", bsdf=cases.diffuse(0.5))
     scene = cases.scene(sensor=cases.camera(), thing=thing, floor=floor, sky=cases.constant())
     found = said(scene, "thing.vertex_positions", kind="prb_edge", max_depth=max_depth)
-    assert any('"thing" reflects to other surfaces' in message for message in found) == warns
+    assert any('"thing" reflect to other surfaces' in message for message in found) == warns
 
 
 @pytest.mark.parametrize("distance", [0, 100, 1e4])

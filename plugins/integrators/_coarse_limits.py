@@ -1,0 +1,51 @@
+"""What derivatives lack of the light of coarse smooth-shaded meshes: the sentences that say so."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from rimlight._plan import names
+from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
+from rimlight.edge_sampling.geometry.meshes import surfaces
+
+#: How far the cosine between the normals of faces and vertices may be below 1, without a warning.
+FRINGE = 0.005
+
+#: The same, of what reflects light to other surfaces.
+TURNED = 0.1
+
+
+def coarse_lamps(scene: mi.Scene) -> list[str]:
+    """What the derivative lacks of the light that smooth-shaded meshes throw: Mitsuba reckons it with interpolated
+    normals, but faces turn away one after the other, each while its light is not yet 0."""
+    shapes = [e.get_shape() for e in scene.emitters() if e.get_shape() is not None]
+    return [
+        f"where the light of {names([s])[0]} falls, the derivative is off by up to about {100 * fringe(s):.1g} %, "
+        "since Mitsuba shades the faces of its coarse mesh with interpolated normals. Give it a finer mesh or face "
+        "normals."
+        for s in shapes
+        if fringe(s) > FRINGE
+    ]
+
+
+def coarse_meshes(scene: mi.Scene) -> list[str]:
+    """What a derivative without `FacePlanes` lacks: the faces of smooth-shaded meshes hide light from themselves."""
+    sized = [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Delta and not hasattr(e, "light_count")]
+    coarse = names(s for s in surfaces(scene) if fringe(s) > FRINGE) if sized else []
+    if not coarse:
+        return []
+    return [
+        f"the derivative lacks what the faces of {', '.join(coarse)} hide of lamps with a size, while interpolated "
+        "normals go on being lit. Give them finer meshes or face normals, or use direct_edge or prb_edge."
+    ]
+
+
+def coarse_reflectors(scene: mi.Scene) -> list[str]:
+    """What the derivative lacks of indirect light: surfaces see where interpolated normals turn away from them, too."""
+    coarse = names(s for s in surfaces(scene) if not s.is_emitter() and fringe(s) > TURNED)
+    if not coarse:
+        return []
+    return [
+        f"the derivative of the light that {', '.join(coarse)} reflect to other surfaces is off by some per cent: "
+        "where interpolated normals turn away from these surfaces, it jumps. Use finer meshes or face normals."
+    ]
