@@ -58,8 +58,9 @@ class PlanCommand(OnSensor):
 
     param: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KEY")] = ()
     """Parameter that changes, as `rimlight params` lists it. May be repeated. Default: the camera and all vertices."""
-    integrator: str = "prb_edge"
-    """Integrator that renders: direct_edge, prb_edge or bdpt_edge."""
+    integrator: str | None = None
+    """Integrator that renders: direct_edge, prb_edge or bdpt_edge. Default: the scene's own if it is one of these, or
+    else prb_edge."""
     spp: int = 16
     """Samples per pixel."""
     images: bool = False
@@ -69,9 +70,11 @@ class PlanCommand(OnSensor):
     def run(self) -> int:
         at_least(1, spp=self.spp)
         scene = self.load()
-        integrator = load_integrator(self.integrator)
+        integrator = scene.integrator() if self.integrator is None else load_integrator(self.integrator)
         if not hasattr(integrator, "plan"):
-            raise InputError(f'--integrator: "{self.integrator}" has no plan, use direct_edge or prb_edge')
+            if self.integrator is not None:
+                raise InputError(f'--integrator: "{self.integrator}" has no plan, use direct_edge or prb_edge')
+            integrator = load_integrator("prb_edge")
         keys = list(self.param) or [
             key
             for key, _, _ in _loading.differentiable(scene)

@@ -212,6 +212,19 @@ def test_bugs_keep_their_traceback(monkeypatch, tmp_path):
 # ------------------------------------------------------------------ good runs
 
 
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [([], "direct_edge"), (["--integrator", "prb_edge"], "prb_edge"), (["-D", "integrator=path"], "prb_edge")],
+)
+def test_plan_is_that_of_the_integrator_of_the_scene(options, name, tmp_path, capsys):
+    """If that is one of Rimlight, and no other one is named."""
+    scene = tmp_path / "scene.xml"
+    which = '<default name="integrator" value="direct_edge"/><integrator type="$integrator"/>'
+    scene.write_text(scene_with(which + '<shape type="cube"/>'))
+    assert main(["plan", str(scene), *options]) == 0
+    assert capsys.readouterr().out.startswith(f"{name}: ")
+
+
 def test_params(capsys):
     assert main(["params", TRIANGLES]) == 0
     rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
