@@ -50,7 +50,8 @@ class BDPTIntegrator(ADIntegrator):
     vertex of a light path; each vertex of a light path, with the camera. All ways in which a path may have been made
     share it by the power heuristic (Veach 1997), see the documentation under "Theory".
 
-    Of lights without size, it also has the caustics that perfect mirrors and smooth glass throw, which ``path`` lacks.
+    Of lights without size, it also has the caustics that perfect mirrors and smooth glass throw, and what comes through
+    a ``mask``, which ``path`` lacks.
 
     **Supported** are all emitters, ``directionalarea`` among them, all BSDFs and shapes. Light paths are connected with
     ``perspective``, ``thinlens``, ``orthographic`` and ``fisheye`` sensors, and batches of them. All other sensors see
