@@ -87,13 +87,13 @@ class TextureEdges:
         return VERTICES * self.capacity
 
     def find(self) -> bool:
-        """Find the pieces, as the texture coordinates are now; return whether there is now more space for them. On the
-        host, and reads from the device: not in frozen functions."""
+        """Find the pieces, as the texture coordinates are now; return whether there is now more space for them, or
+        others count. On the host, and reads from the device: not in frozen functions."""
         uv = {i: dr.detach(texcoords_of(inner(self._meshes[i]))) for i in self._lattices}
         changed = [i for i, a in uv.items() if i not in self._at or a.index != self._at[i].index]
         if not changed:
             return False
-        self._at, before = uv, dict(self.capacities)
+        self._at, before, were_fine = uv, dict(self.capacities), self.fine
         for i in changed:
             self._pieces[i] = self._of_mesh(i)
             count = len(self._pieces[i][0])
@@ -112,7 +112,7 @@ class TextureEdges:
         self._corners = [mi.UInt32(corners[:, k].astype(np.uint32)) + dr.opaque(mi.UInt32, 0) for k in range(3)]
         *self._rows, self._sizes = (mi.Float(rows[:, k].copy()) * dr.opaque(mi.Float, 1) for k in range(4))
         dr.eval(self._corners, self._rows, self._sizes)
-        return self.capacities != before
+        return self.capacities != before or bool((self.fine != were_fine).any())
 
     def _of_mesh(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Vertices of the triangles of the pieces of a mesh, (P, 3), and their coefficients and sizes, (P, 4)."""

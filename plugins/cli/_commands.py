@@ -82,7 +82,8 @@ class PlanCommand(OnSensor):
         ]
         print(rimlight.plan(scene, keys, integrator=integrator, sensor=self.sensor, spp=self.spp))
         if self.images:
-            self._advise(scene, integrator.depths.max_depth)
+            # Channels have no reflected light, images do.
+            self._advise(scene, max(integrator.depths.max_depth, 2))
         return 0
 
     def _advise(self, scene: Any, longest: int) -> None:

@@ -101,8 +101,8 @@ def lasting_limits(
     planes: bool,
     from_points: bool,
 ) -> tuple[str, ...]:
-    """What the derivative will lack as long as the edges stay what they are. lined : see
-    `appearance`. planes, from_points : see `BoundarySearch`."""
+    """What the derivative will lack as long as the edges stay what they are. lined : see `appearance`. planes,
+    from_points : see `BoundarySearch`."""
     limits = []
     if sppi:
         limits += reflected_light(scene, geometry, depths, from_points=from_points)
@@ -110,8 +110,8 @@ def lasting_limits(
         if depths.scatters(1):
             limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
-        if depths.scatters(2) and from_points:
-            limits += coarse_reflectors(scene)
+    if depths.scatters(2) and from_points and (sppi or any(moving.turning)):
+        limits += coarse_reflectors(scene)
     return (
         *limits,
         *appearance(scene, depths, moving, lined, bisects=from_points),
@@ -218,12 +218,13 @@ def appearance(
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
             f"{', '.join(mapped)} turn away from what they light."
         )
-    unknown = names(s for s in surfaces(scene) if moving.anything and s not in lined and lattices(s))
+    unknown = [s for s in surfaces(scene) if moving.anything and s not in lined and lattices(s)]
     if unknown and bisects and depths.scatters(2):
+        little = "" if any(s in moving.sliding for s in unknown) else ", which matter little if they are fine"
         limits.append(
-            f"the derivative lacks, in the light that {', '.join(unknown)} throw on surfaces close to them, the jumps "
-            "of their textures, which matter little if they are fine; use bilinear bitmaps, or meshes with texture "
-            f"coordinates and at most {COARSE} lines across."
+            f"the derivative lacks, in the light that {', '.join(names(unknown))} throw on surfaces close to them, the "
+            f"jumps of their textures{little}; use bilinear bitmaps, or meshes with texture coordinates and at most "
+            f"{COARSE} lines across."
         )
     lamps = names(
         s for s in moving.sliding if s.is_emitter() and s.emitter().flags() & mi.EmitterFlags.SpatiallyVarying

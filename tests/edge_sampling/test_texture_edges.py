@@ -84,7 +84,7 @@ def test_they_follow_texture_coordinates():
 
 def test_more_of_them_need_more_space():
     mesh = board()
-    edges, params = TextureEdges(Geometry((mesh,)), every=False), mi.traverse(mesh)
+    edges, params = TextureEdges(Geometry((mesh,)), every=True), mi.traverse(mesh)
     edges.find()
     for scale, more in ((1.05, False), (8, True), (0.1, False)):
         params["vertex_texcoords"] = mi.Float(np.ravel([[0.9 * scale * x / 2, 0.1] for x, *_ in corners_of(mesh)]))
@@ -113,3 +113,12 @@ def test_fine_textures_count_where_they_move_over_their_surface(columns, fine):
         edges.find()
         assert (edges.fine == (fine and not every)).all() and len(edges.fine) == edges.capacity > 0
         assert edges.shapes([mesh]) == [mesh] and edges.shapes([]) == [mesh] * (every or not fine)
+
+
+def test_textures_that_are_no_longer_fine_are_found_anew():
+    mesh = board(checkers(9.0))
+    edges, params = TextureEdges(Geometry((mesh,)), every=False), mi.traverse(mesh)
+    assert edges.find() and edges.fine.all() and not edges.find()
+    params["vertex_texcoords"] *= 0.5
+    params.update()
+    assert edges.find() and not edges.fine.any()
