@@ -11,6 +11,9 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.refusals import InputError
 
+#: Most names that a message lists.
+MOST = 5
+
 
 @dataclass(frozen=True)
 class PlannedTerm:
@@ -59,9 +62,9 @@ class Plan:
         return sum(t.samples * t.rays for t in self.terms)
 
     def __str__(self) -> str:
-        moves = [*self.moving, *(["the camera"] if self.camera_moves else [])]
+        moves = [*(["the camera"] if self.camera_moves else []), *self.moving]
         lines = [
-            f"{self.integrator}: {', '.join(moves) or 'nothing'} move{'s' if len(moves) < 2 else ''}"
+            f"{self.integrator}: {listed(moves) or 'nothing'} move{'s' if len(moves) < 2 else ''}"
             + (", lights among them" if self.lights_move else ""),
             f"{self.edges} edges; " + (f"tree of {self.tree} leaves" if self.tree else "no tree"),
         ]
@@ -114,6 +117,14 @@ def plan(
         for k, value in before.items():
             known[k] = value
         known.update()
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names in a message: the first `MOST` of them, and how many more there are."""
+    every = list(names)
+    more = len(every) - MOST
+    # One more name is no longer than the words that would stand in its place.
+    return ", ".join(every) if more <= 1 else f"{', '.join(every[:MOST])}, and {more} more"
 
 
 def names(shapes: Iterable[Any]) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight._plan import names
+from rimlight._plan import listed, names
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.parameters import parameters
 from rimlight.edge_sampling.refusals import Refusal
@@ -57,7 +57,7 @@ class BidirectionalLimits:
         if delta and any(is_mirror(s) for s in scene.shapes()):
             limits.append(
                 f"the derivative lacks the caustics that perfect mirrors and glass throw in the light of "
-                f"{', '.join(names(delta))}, though the image has them; give the mirrors a roughness, or the light a "
+                f"{listed(names(delta))}, though the image has them; give the mirrors a roughness, or the light a "
                 "size."
             )
         with dr.resume_grad():

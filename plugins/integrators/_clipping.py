@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight._plan import names
+from rimlight._plan import listed, names
 from rimlight.edge_sampling import film_parts
 from rimlight.edge_sampling.geometry.meshes import vertices
 
@@ -32,7 +32,7 @@ def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
     if not cut:
         return []
     return [
-        f'the derivative lacks the cut of the far clipping plane of "{sensor.id()}" through {", ".join(cut)}; '
+        f'the derivative lacks the cut of the far clipping plane of "{sensor.id()}" through {listed(cut)}; '
         f"increase its far_clip, now {far:g}."
     ]
 

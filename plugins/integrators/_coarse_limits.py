@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from rimlight._plan import names
+from rimlight._plan import listed, names
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.meshes import surfaces
 
@@ -19,12 +19,13 @@ def coarse_lamps(scene: mi.Scene) -> list[str]:
     """What the derivative lacks of the light that smooth-shaded meshes throw: Mitsuba reckons it with interpolated
     normals, but faces turn away one after the other, each while its light is not yet 0."""
     shapes = [e.get_shape() for e in scene.emitters() if e.get_shape() is not None]
+    fringes = {s: fringe(s) for s in shapes if fringe(s) > FRINGE}
+    if not fringes:
+        return []
+    largest = float(f"{100 * max(fringes.values()):.1g}")
     return [
-        f"where the light of {names([s])[0]} falls, the derivative is off by up to about {100 * fringe(s):.1g} %, "
-        "since Mitsuba shades the faces of its coarse mesh with interpolated normals. Give it a finer mesh or face "
-        "normals."
-        for s in shapes
-        if fringe(s) > FRINGE
+        f"where the light of {listed(names(fringes))} falls, the derivative is off by up to about {largest:g} %, since "
+        "Mitsuba shades the faces of coarse meshes with interpolated normals. Give them finer meshes or face normals."
     ]
 
 
@@ -35,7 +36,7 @@ def coarse_meshes(scene: mi.Scene) -> list[str]:
     if not coarse:
         return []
     return [
-        f"the derivative lacks what the faces of {', '.join(coarse)} hide of lamps with a size, while interpolated "
+        f"the derivative lacks what the faces of {listed(coarse)} hide of lamps with a size, while interpolated "
         "normals go on being lit. Give them finer meshes or face normals, or use direct_edge or prb_edge."
     ]
 
@@ -46,6 +47,6 @@ def coarse_reflectors(scene: mi.Scene) -> list[str]:
     if not coarse:
         return []
     return [
-        f"the derivative of the light that {', '.join(coarse)} reflect to other surfaces is off by some per cent: "
+        f"the derivative of the light that {listed(coarse)} reflect to other surfaces is off by some per cent: "
         "where interpolated normals turn away from these surfaces, it jumps. Use finer meshes or face normals."
     ]

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight._plan import names
+from rimlight._plan import listed, names
 from rimlight.edge_sampling import (
     Cracks,
     Geometry,
@@ -130,7 +130,7 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
     beams = names(e for e in scene.emitters() if has_hard_beam(e))
     if beams and not from_points:
         limits.append(
-            f"the derivative lacks the border of the beams of {', '.join(beams)}: give a spot a beam_width below its "
+            f"the derivative lacks the border of the beams of {listed(beams)}: give a spot a beam_width below its "
             "cutoff_angle, and a projector an image with a black border."
         )
     if any(is_mirror(s) for s in surfaces(scene)) and (depths.scatters(2) or not from_points):
@@ -143,7 +143,7 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
     casts = names(s for s in geometry.others if not s.is_emitter())
     if casts:
         limits.append(
-            f"the derivative lacks the shadows and reflections of {', '.join(casts)} on what moves, or in moving "
+            f"the derivative lacks the shadows and reflections of {listed(casts)} on what moves, or in moving "
             "light: their silhouettes are unknown. Replace them by meshes."
         )
     return limits
@@ -155,14 +155,14 @@ def veils(scene: mi.Scene, *, from_points: bool) -> list[str]:
     if through and not from_points:
         return [
             "the derivative lacks part of the motion of what is seen, and of what shines, through "
-            f'{", ".join(names(through))}; cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
+            f'{listed(names(through))}; cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
         ]
     limits = []
     coarse = names(s for s in surfaces(scene) if (s not in through or not is_flat(s)) and fringe(s) > FRINGE)
     if coarse and through:
         limits.append(
-            f"the derivative is off at the outlines of {', '.join(coarse)} that are seen through "
-            f"{', '.join(names(through))}: interpolated normals turn away from the sensor there. Give them finer "
+            f"the derivative is off at the outlines of {listed(coarse)} that are seen through "
+            f"{listed(names(through))}: interpolated normals turn away from the sensor there. Give them finer "
             "meshes or face normals."
         )
     return limits
@@ -204,25 +204,25 @@ def appearance(
     textures = jumping_textures(scene, besides=(*surfaces(scene), *beams) if bisects else ())
     if textures:
         limits.append(
-            f"the derivative lacks the jumps of the textures {', '.join(textures)}; use bilinear bitmaps, and "
+            f"the derivative lacks the jumps of the textures {listed(textures)}; use bilinear bitmaps, and "
             "normal maps for bump maps."
         )
     mapped = names(s for s in moving.with_lines if has_normal_map(s))
     if mapped and not bisects:
         limits.append(
-            f"the derivative is off by some per cent at the outlines of {', '.join(mapped)}: the normals of a normal "
+            f"the derivative is off by some per cent at the outlines of {listed(mapped)}: the normals of a normal "
             "map turn away from the sensor along lines inside of faces, whose jumps are not sampled."
         )
     elif mapped and depths.scatters(2):
         limits.append(
             f"the derivative lacks, in indirect light, the lines along which the normals of the maps of "
-            f"{', '.join(mapped)} turn away from what they light."
+            f"{listed(mapped)} turn away from what they light."
         )
     unknown = [s for s in surfaces(scene) if moving.anything and s not in lined and lattices(s)]
     if unknown and bisects and depths.scatters(2):
         little = "" if any(s in moving.sliding for s in unknown) else ", which matter little if they are fine"
         limits.append(
-            f"the derivative lacks, in the light that {', '.join(names(unknown))} throw on surfaces close to them, the "
+            f"the derivative lacks, in the light that {listed(names(unknown))} throw on surfaces close to them, the "
             f"jumps of their textures{little}; use bilinear bitmaps, or meshes with texture coordinates and at most "
             f"{COARSE} lines across."
         )
@@ -231,7 +231,7 @@ def appearance(
     )
     if lamps:
         limits.append(
-            f"Mitsuba goes on to look for the light of {', '.join(lamps)} by the texture coordinates that they had at "
+            f"Mitsuba goes on to look for the light of {listed(lamps)} by the texture coordinates that they had at "
             "first: load the scene anew after each step, or set the sampling_weight of these lamps to 0."
         )
     mirrors = [s for s in surfaces(scene) if is_mirror(s)] if depths.scatters(1) else []
@@ -239,7 +239,7 @@ def appearance(
     if stepped:
         limits.append(
             "the derivative is off where the normals of maps turn away, and in what mirrors and glass with maps show, "
-            f"since this GPU interpolates the bitmaps {', '.join(stepped)} in {round(1 / TEXTURE_UNIT_STEP)} steps; "
+            f"since this GPU interpolates the bitmaps {listed(stepped)} in {round(1 / TEXTURE_UNIT_STEP)} steps; "
             'set their property "accel" to false.'
         )
     slides = moving.camera or moving.lights or (mirrors and moving.anything)
@@ -251,7 +251,7 @@ def appearance(
     discs = names(e for e in scene.emitters() if getattr(e, "shows_discs", False)) if slides else []
     if discs:
         limits.append(
-            f"the derivative lacks the outlines of the discs of {', '.join(discs)}, where the camera sees them, or "
+            f"the derivative lacks the outlines of the discs of {listed(discs)}, where the camera sees them, or "
             "mirrors show them."
         )
     return limits
@@ -263,32 +263,32 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
     grids = names(s for s in geometry.others if s.class_name() == "SDFGrid")
     if grids:
         limits.append(
-            f"the derivative is off by up to a fifth at the silhouettes of {', '.join(grids)} (sdfgrid), which are not "
+            f"the derivative is off by up to a fifth at the silhouettes of {listed(grids)} (sdfgrid), which are not "
             "known: give the grid as many values along each axis as along the others."
         )
     hard = any(e.flags() & mi.EmitterFlags.Delta or hasattr(e, "light_count") for e in scene.emitters())
     shaded = names(g.inner for g in grids_of(geometry) if moving.anything and hard)
     if shaded:
         limits.append(
-            f"the derivative is off by up to a tenth in parts of the shading of {', '.join(shaded)} (sdfgrid), in "
+            f"the derivative is off by up to a tenth in parts of the shading of {listed(shaded)} (sdfgrid), in "
             "lights without a size, at the shadow that it throws on itself."
         )
     shiny = names(g.inner for g in grids_of(geometry) if g in moving.on_film and is_mirror(g.inner))
     if shiny:
         limits.append(
-            f"the derivative is noisy, and off by up to a fifth, in what {', '.join(shiny)} (sdfgrid) show, perfect "
+            f"the derivative is noisy, and off by up to a fifth, in what {listed(shiny)} (sdfgrid) show, perfect "
             "mirrors or glass that move. Give them a roughness, or replace them by meshes."
         )
     turned = names(s for s in moving.known if not has_its_inverse(s))
     if turned:
         limits.append(
-            f'the derivative is wrong for {", ".join(turned)}: the inverse of "to_world" is not the one that Mitsuba '
+            f'the derivative is wrong for {listed(turned)}: the inverse of "to_world" is not the one that Mitsuba '
             "keeps. It takes the axis of `rotate` as it is: give it the length 1."
         )
     moves = lambda s: s in moving.on_film
     cut = sorted({tuple(sorted((a.id(), b.id()))) for a, b in cuts_of_others(scene, geometry) if moves(a) or moves(b)})
     if cut:
-        pairs = ", ".join(f'"{a}" and "{b}"' for a, b in cut)
+        pairs = listed(f'"{a}" and "{b}"' for a, b in cut)
         limits.append(
             "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
             f"such nor meshes: {pairs}. Replace them by meshes."
@@ -297,7 +297,7 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
     if pairs:
         limits.append(
             f"the derivative lacks the curves in which grids of signed distances cut through other shapes: "
-            f"{', '.join(pairs)}. Replace the grids by meshes, or move them apart."
+            f"{listed(pairs)}. Replace the grids by meshes, or move them apart."
         )
     closed = {
         tuple(geometry.meshes[i].id() for i in pair): width
@@ -305,7 +305,7 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
         if moving.camera or any(moving.flags[i] for i in pair)
     }
     if closed:
-        pairs = ", ".join(f'"{a}"' if a == b else f'"{a}" and "{b}"' for a, b in sorted(closed))
+        pairs = listed(f'"{a}"' if a == b else f'"{a}" and "{b}"' for a, b in sorted(closed))
         limits.append(
             f"the derivative takes cracks between open edges for closed, which are up to {max(closed.values()):.1g} "
             f"units wide: {pairs}. Join the vertices there, or move them farther apart."
@@ -392,7 +392,7 @@ def refuse_timed_sky(scene: mi.Scene, who: str) -> None:
     timed = names(e for e in scene.emitters() if e.class_name() == "TimedSunskyEmitter")
     if timed and dr.flag(dr.JitFlag.SymbolicLoops):
         raise Refusal(
-            f"{who}: Mitsuba cannot sample {', '.join(timed)} (timed_sunsky) in symbolic loops. Replace it by sunsky."
+            f"{who}: Mitsuba cannot sample {listed(timed)} (timed_sunsky) in symbolic loops. Replace it by sunsky."
         )
 
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import collect_before
-from rimlight._plan import names
+from rimlight._plan import listed, names
 from rimlight.edge_sampling import (
     Cracks,
     CutCurves,
@@ -223,13 +223,13 @@ class BoundarySearch:
         mirrors = names(s for s in moving.shapes if hasattr(s, "instance") and is_mirror(s))
         if mirrors:
             raise Refusal(
-                f"{self.who}: instances {', '.join(mirrors)} move, and are mirrors or glass: where the jumps in what "
+                f"{self.who}: instances {listed(mirrors)} move, and are mirrors or glass: where the jumps in what "
                 "they show go is not known. Replace them by meshes."
             )
         flat = names(s for s in moving.shapes if hasattr(s, "instance") and is_flat(s.instance))
         if flat:
             raise Refusal(
-                f'{self.who}: instances {", ".join(flat)} move, and are flat: their "to_world" has no inverse. Give '
+                f'{self.who}: instances {listed(flat)} move, and are flat: their "to_world" has no inverse. Give '
                 "them a thickness."
             )
 

@@ -244,8 +244,8 @@ class AOVEdgeIntegrator(EdgeIntegrator):
         tracer.footprint = spp**-0.5
         return tracer
 
-    def job(self, scene, sensor, seed=0, spp=0, mode=dr.ADMode.Primal) -> Job:
-        job = super().job(scene, sensor, seed, spp, mode)
+    def _job(self, scene, sensor, seed, spp, mode) -> Job:
+        job = super()._job(scene, sensor, seed, spp, mode)
         return replace(job, tracer=self._tracer(scene, job.weights))
 
     # ---------------------- What is to be done ----------------------

@@ -96,14 +96,14 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
         self.light_paths, self.limits = light_paths_of(props), BidirectionalLimits()
         self._around: Around | None = None
 
-    def job(self, scene, sensor, seed=0, spp=0, mode=dr.ADMode.Primal) -> Job:
+    def _job(self, scene, sensor, seed, spp, mode) -> Job:
         """As that of `EdgeIntegrator`.
 
         Raises
         ------
         RuntimeError : the scene has lights or media of which paths from both ends have no derivative.
         """
-        job = super().job(scene, sensor, seed, spp, mode)
+        job = super()._job(scene, sensor, seed, spp, mode)
         job.tracer.around = self._around
         return job
 
@@ -120,7 +120,7 @@ class BDPTEdgeIntegrator(prb_edge.PRBEdgeIntegrator):
     def _boundaries(self, scene, sensor, sppi, find=None):
         self.limits.refuse(scene, self.name)
         boundaries = super()._boundaries(scene, sensor, sppi, find)
-        self._warn(self.limits.of(scene))
+        boundaries = replace(boundaries, limits=(*boundaries.limits, *self.limits.of(scene)))
         if not dr.flag(dr.JitFlag.FreezingScope):
             self._around = Around(scene)
         return boundaries

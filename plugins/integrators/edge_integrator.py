@@ -274,9 +274,15 @@ class EdgeIntegrator(ADIntegrator):
 
     def job(self, scene, sensor, seed=0, spp=0, mode=dr.ADMode.Primal) -> Job:
         """A derivative with respect to the parameters that carry a gradient now. Warns of what it will lack."""
-        sensor = self._sensor(scene, sensor)
-        if self._rendered.has_changed(scene, sensor, seed):
+        if self._rendered.has_changed(scene, self._sensor(scene, sensor), seed):
             self._warn([CHANGED])
+        job = self._job(scene, sensor, seed, spp, mode)
+        self._warn(job.boundaries.limits)
+        return job
+
+    def _job(self, scene, sensor, seed, spp, mode) -> Job:
+        """The same, without a warning."""
+        sensor = self._sensor(scene, sensor)
         counts = self._counts(sensor, spp)
         boundaries = self._boundaries(scene, sensor, counts.shading)
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
@@ -294,7 +300,7 @@ class EdgeIntegrator(ADIntegrator):
     def plan(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> Plan:
         """What a derivative with respect to the parameters that carry a gradient now will do, see `rimlight.plan`."""
         with dr.suspend_grad():
-            job = self.job(scene, sensor, spp=spp)
+            job = self._job(scene, sensor, 0, spp, dr.ADMode.Primal)
         found, search = job.boundaries, self.search
         shapes = zip((*search.geometry.meshes, *search.geometry.analytic), found.moving, strict=False)
         return Plan(
@@ -378,13 +384,13 @@ class EdgeIntegrator(ADIntegrator):
         """
         sensor = self._sensor(scene, sensor)
         with dr.suspend_grad():
-            return self._boundaries(scene, sensor, self._counts(sensor, 0).shading, self.search.prepare)
+            found = self._boundaries(scene, sensor, self._counts(sensor, 0).shading, self.search.prepare)
+        self._warn(found.limits)
+        return found
 
     def _boundaries(self, scene, sensor, sppi, find=None) -> Boundaries:
         self.search.depths = self.depths
-        boundaries = (find or self.search.boundaries)(scene, sensor, sppi)
-        self._warn(boundaries.limits)
-        return boundaries
+        return (find or self.search.boundaries)(scene, sensor, sppi)
 
     def _warn(self, limits: Sequence[str]) -> None:
         """Say what a derivative lacks, once."""

@@ -12,6 +12,8 @@ import pytest
 import sliding_textures
 from random_scenes import ball
 
+import rimlight
+from rimlight._plan import listed
 from rimlight.edge_sampling.geometry import texture_lines
 
 FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
@@ -37,6 +39,29 @@ def said(scene, *keys: str, kind: str = "direct_edge", derivative: bool = False,
     limits = integrator.plan(scene).limits
     assert [m.split(f"{kind}: ", 1)[1] for m in messages] == list(limits)
     return messages
+
+
+# ---------------------- Scenes of many shapes ----------------------
+
+
+def test_long_lists_of_names_are_cut_short():
+    assert listed(["a", "b"]) == "a, b"
+    assert listed("abcdef") == "a, b, c, d, e, f"
+    assert listed("abcdefgh") == "a, b, c, d, e, and 3 more"
+
+
+def test_many_coarse_lamps_are_one_warning_and_plans_log_nothing():
+    points, _, _, faces = ball(4)
+    names = [f"lamp_{i}" for i in range(8)]
+    at = lambda i: np.array([3 * i, 0, 0])
+    mesh = lambda i, name: cases.mesh(name, points + at(i), faces, normals=True, emitter=cases.light(1, 1, 1))
+    lamps = {name: mesh(i, name) for i, name in enumerate(names)}
+    scene = cases.scene(sensor=cases.camera((0, 0, -9), (0, 0, 0)), **lamps)
+    with cases.messages() as messages:
+        plan = rimlight.plan(scene, ["lamp_0.vertex_positions"], integrator=mi.load_dict({"type": "prb_edge"}))
+    (limit,) = [text for text in plan.limits if "coarse meshes" in text]
+    assert '"lamp_4", and 3 more falls' in limit and "e+" not in limit
+    assert not [m for m in messages if "prb_edge: " in m]
 
 
 # ---------------------- The far clipping plane ----------------------
