@@ -8,6 +8,8 @@ component of A·(u, v, 1) is whole, with a matrix A of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -43,6 +45,21 @@ TEXELS, PLACES_OF_STEP, FIRST_TEXELS = 1024, 8, 2048
 
 #: Points at which a volume is looked at for its brightest and its darkest voxel.
 PLACES = 2**20
+
+
+#: Which textures jump, within `looked_at_once`: by texture, and by where it was looked at. The textures are kept as
+#: well, so that nothing else gets their numbers.
+_KNOWN: ContextVar[dict[tuple, tuple[Any, bool]] | None] = ContextVar("_KNOWN", default=None)
+
+
+@contextmanager
+def looked_at_once() -> Iterator[None]:
+    """Look at each texture once, though many shapes may have it, and several ask. Nothing may change meanwhile."""
+    token = _KNOWN.set({})
+    try:
+        yield
+    finally:
+        _KNOWN.reset(token)
 
 
 @dataclass(frozen=True)
@@ -290,7 +307,17 @@ def _colours(texture: mi.Texture) -> list[Any]:
     return [v for key, v in mi.traverse(texture).items() if key.endswith(("data", "value"))]
 
 
-def _jumps(texture: Any, lower: list[float], upper: list[float], pairs: int = 256, steps: int = 22) -> bool:
+def _jumps(texture: Any, lower: list[float], upper: list[float]) -> bool:
+    """Does a texture jump between these coordinates?"""
+    known, key = _KNOWN.get(), (id(texture), *lower, *upper)
+    if known is None:
+        return _bisected(texture, lower, upper)
+    if key not in known:
+        known[key] = texture, _bisected(texture, lower, upper)
+    return known[key][1]
+
+
+def _bisected(texture: Any, lower: list[float], upper: list[float], pairs: int = 256, steps: int = 22) -> bool:
     """Bisect segments towards their steeper half: where a texture is continuous, the difference dies out. They are
     random, and that between the brightest texel or voxel and the darkest, since few may differ from all others.
 
@@ -322,7 +349,7 @@ def _brightest_and_darkest(texture: mi.Texture) -> np.ndarray:
     params = mi.traverse(texture)
     if "data" not in params:
         return np.zeros((0, 2, 2))
-    data = np.array(dr.detach(params["data"])).sum(2)
+    data = sum(np.moveaxis(np.array(dr.detach(params["data"])), 2, 0))
     y, x = np.unravel_index([data.argmax(), data.argmin()], data.shape)
     u, v = (x + 0.5) / data.shape[1], (y + 0.5) / data.shape[0]
     return _from_texture(texture, np.stack([np.stack([u, w], -1) for w in (v, 1 - v)]))

@@ -46,6 +46,7 @@ from rimlight.edge_sampling.geometry.meshes import inner, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_edges import TextureEdges
+from rimlight.edge_sampling.geometry.texture_lines import looked_at_once
 from rimlight.edge_sampling.parametrisation import Slides, slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
@@ -103,6 +104,7 @@ class BoundarySearch:
         self._checked = True
         return boundaries
 
+    @looked_at_once()
     def boundaries(self, scene: mi.Scene, sensor: mi.Sensor, sppi: int) -> Boundaries:
         """The boundaries that can contribute to a derivative with respect to the parameters that carry a gradient now.
 

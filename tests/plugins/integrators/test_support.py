@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import rimlight
 from rimlight import merl_tables
 from rimlight.checks import (
     Agreement,
@@ -34,6 +35,7 @@ from rimlight.checks import (
     z_scores,
 )
 from rimlight.edge_sampling import EdgeKind, Geometry, find_edges, jumping_textures
+from rimlight.edge_sampling.geometry import texture_lines
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "support.md"
 WORDS = ("exact", "warned", "refused", "untested", "—")
@@ -1041,3 +1043,15 @@ def test_a_single_voxel_jumps(filter_type, other):
     voxels[3, 9, 12] = other
     scene = stage({"thing": sheet("thing", np.array([0, 0, 1]), volume(filter_type, voxels))})
     assert bool(jumping_textures(scene)) == (filter_type == "nearest" and other != 0.5)
+
+
+def test_each_texture_is_looked_at_once(monkeypatch):
+    """Though eight shapes have it, and several parts of the search ask."""
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32)), "filter_type": "nearest"}
+    bsdf = mi.load_dict({"type": "diffuse", "reflectance": texture})
+    shapes = {f"{i}": cases.quad((i, 0, 0), (1, 0, 0), (0, 1, 0), f"{i}", bsdf=bsdf) for i in range(8)}
+    scene = cases.scene(sensor=cases.camera(), sky=cases.constant(), **shapes)
+    looks, bisected = [], texture_lines._bisected
+    monkeypatch.setattr(texture_lines, "_bisected", lambda *args: looks.append(args) or bisected(*args))
+    rimlight.plan(scene, ["0.vertex_positions"], integrator=mi.load_dict({"type": "prb_edge"}))
+    assert len(looks) == 1
