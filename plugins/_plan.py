@@ -119,6 +119,11 @@ def plan(
         known.update()
 
 
+def counted(number: int, what: str) -> str:
+    """A number of things, for messages."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def listed(names: Iterable[str]) -> str:
     """Names in a message: the first `MOST` of them, and how many more there are."""
     every = list(names)

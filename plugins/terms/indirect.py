@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight._plan import PlannedTerm
+from rimlight._plan import PlannedTerm, counted
 from rimlight.edge_sampling import IndirectShadows
 from rimlight.transport.cut import Cut
 from rimlight.transport.paths import Vertex
@@ -24,7 +24,7 @@ class IndirectShadowsTerm(FromPoints):
     def planned(self, job: Job) -> PlannedTerm:
         found = self.boundary(job)
         count = job.counts.shading * job.pixels if found else 0
-        why = f"{max(map(len, found), default=0)} lights"
+        why = counted(max(map(len, found), default=0), "light")
         return self.plan(count, job.rays_of_path, why, "no light is scattered twice, or no edge moves")
 
     def boundary(self, job: Job) -> tuple[IndirectShadows, ...]:

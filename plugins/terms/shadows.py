@@ -8,7 +8,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
-from rimlight._plan import PlannedTerm
+from rimlight._plan import PlannedTerm, counted
 from rimlight.edge_sampling import FilmPart
 
 from .sampling import over_film, seed_of
@@ -25,7 +25,7 @@ class ShadowsTerm(Term):
         count = job.counts.shading * job.pixels if shadows is not None else 0
         lights = len(shadows) if shadows is not None else 0
         why_not = "no lights but the environment" if shading is not None else nothing_at_points(job)
-        return self.plan(count, 3, f"{lights} lights", why_not)
+        return self.plan(count, 3, counted(lights, "light"), why_not)
 
     def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
         if job.boundaries.shadows is None:
