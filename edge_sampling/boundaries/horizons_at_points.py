@@ -37,7 +37,7 @@ from .tracer import ShadingPoint, Tracer
 COARSE = 0.03
 
 #: Faces of which one is kept, in proportion to what its curve contributes if nothing hides it.
-CANDIDATES = 8
+CANDIDATES = 16
 
 
 class HorizonsAtPoints:
