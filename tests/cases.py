@@ -29,6 +29,7 @@ from building import (
     quad,
     scene,
 )
+from coarse import COARSE
 from cuts import CURVES, CUTS
 from grids import GRIDS, LONGER
 from hidden_lights import HIDDEN
@@ -974,6 +975,18 @@ CASES = [
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
         for k, of in HIDDEN.items()
+    ),
+    *(
+        Case(
+            k,
+            *of,
+            spp=64,
+            runs=24,
+            integrator={"type": kind, "max_depth": 3},
+            reference_spp=4096,
+            reference_images="bdpt",
+        )
+        for k, (*of, kind) in COARSE.items()
     ),
 ]
 

@@ -84,6 +84,12 @@ MUTANTS = [
         "value += 2 * jump * dr.select",
     ),
     mutant(
+        "horizons from points: twice as large",
+        "edge_sampling/boundaries/horizons_at_points.py",
+        "return weight * jump * dr.select",
+        "return 2 * weight * jump * dr.select",
+    ),
+    mutant(
         "edges from points: density of candidates 2 % off",
         SHADING,
         "e.density *= dr.select(emission,",

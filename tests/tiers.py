@@ -28,7 +28,7 @@ MORE_CASES = (
     "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
     "hidden_picture box_behind_glass spike patchwork_camera stretched_ball lampshade_wall sunk_sphere_slides "
     "pillar_turns strip_wall cut_bulb polished_camera polished_floor polished_rises "
-    "rippled_mirror checkers_throw checkers_beside lamp_slides"
+    "rippled_mirror checkers_throw checkers_beside lamp_slides coarse_normals coarse_slides coarse_hill"
 )
 
 #: Slow tests, by how their names begin.

@@ -53,12 +53,26 @@ class FineMirrors:
 
 def fringe(shape: mi.Shape) -> float:
     """How far the cosine between the normals of faces and vertices is below 1, at most; 0 without interpolated ones."""
+    off, _ = fringes(shape)
+    return float(off.max(initial=0))
+
+
+def mean_fringe(shape: mi.Shape) -> float:
+    """The same, at most of each face, averaged over the area of the faces."""
+    off, area = fringes(shape)
+    return float(off @ area / area.sum()) if off.size else 0.0
+
+
+def fringes(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+    """How far the cosine between the normals of a face and its vertices is below 1, at most, and twice the area of the
+    face: (F,), float64, for the faces with an area and normals; empty without interpolated ones."""
     if not shape.is_mesh() or not has_interpolated_normals(shape):
-        return 0.0
+        return np.zeros(0), np.zeros(0)
     corners, normals = faces(shape), np.array(dr.detach(normals_of(shape))).reshape(-1, 3)
     p = vertices(shape)[corners].astype(np.float64)
-    flat = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None]
-    n = normals[corners]
-    size = np.linalg.norm(flat, axis=2) * np.linalg.norm(n, axis=2)
-    cos = np.abs((flat * n).sum(2))[size > 0] / size[size > 0]
-    return float(1 - cos.min()) if cos.size else 0.0
+    flat = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    n, area = normals[corners], np.linalg.norm(flat, axis=1)
+    size = area[:, None] * np.linalg.norm(n, axis=2)
+    cos = np.abs((flat[:, None] * n).sum(2)) / np.where(size > 0, size, 1)
+    off, there = np.where(size > 0, 1 - cos, 0).max(1), (size > 0).any(1)
+    return off[there], area[there]

@@ -15,6 +15,7 @@ from .deep_shadows import DeepShadows
 from .face_planes import FacePlanes
 from .film_boundary import FilmBoundary
 from .fine_mirrors import FineMirrors
+from .horizons_at_points import HorizonsAtPoints
 from .indirect_shadows import IndirectShadows
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary
@@ -29,7 +30,8 @@ class Boundaries:
     at closely. `textures` : where those jump that the camera may see move, and mapped normals turn away. `shown` :
     shadows that mirrors or glass may show. `surfaces` : what chains meet, where there are mirrors or textures.
     `lights` : chooses one, where there are many. `lamps` : how their light is divided.
-    `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from surfaces."""
+    `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from surfaces.
+    `horizons` : where interpolated normals turn away from points."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -49,6 +51,7 @@ class Boundaries:
     lights: LightChoice | None = None
     deep: DeepShadows | None = None
     lamps: DividedLight | None = None
+    horizons: HorizonsAtPoints | None = None
 
     @property
     def silhouettes(self) -> Silhouettes | None:

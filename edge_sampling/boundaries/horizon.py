@@ -67,6 +67,8 @@ class HorizonPoint:
     tangent : mi.Vector3f, dp/ds. Detached.
     facing : mi.Vector3f, towards where normals face the viewer. Detached.
     normal : mi.Vector3f, that is interpolated there. Detached.
+    front : mi.Vector3f, normal of the face, unit length. Detached.
+    area : mi.Float, of the surface, over an interval of what is sampled and one of the cosine to the viewer. Detached.
     forward : mi.Float; −1 where the curve runs back, as seen from the viewer, as seldom: there, the triangles of a grid
         hide it, and the surface lies on the other side of it than elsewhere.
     valid : mi.Bool, is there one?
@@ -76,6 +78,8 @@ class HorizonPoint:
     tangent: mi.Vector3f
     facing: mi.Vector3f
     normal: mi.Vector3f
+    front: mi.Vector3f
+    area: mi.Float
     forward: mi.Float
     valid: mi.Bool
 
@@ -163,7 +167,7 @@ class Horizons:
         """The point u in [0, 1) of the curve in a face. `positions`, `normals` and `eye` may be attached."""
         p, n = self._face(positions, normals, face)
         with dr.suspend_grad():
-            front = dr.cross(p[1] - p[0], p[2] - p[0])
+            front = dr.normalize(dr.cross(p[1] - p[0], p[2] - p[0]))
         p, n, start, end, valid = _arrange(p, n, dr.detach(eye), far)
         s = dr.lerp(start, end, u)
         D, N = dr.lerp(p[1] - p[0], p[2] - p[0], s), dr.lerp(n[1] - n[0], n[2] - n[0], s)
@@ -184,13 +188,14 @@ class Horizons:
             length2 = dr.squared_norm(tangent)
             valid &= (g_t != 0) & dr.isfinite(length2) & (length2 > 0)
             facing = mi.Vector3f(D) * dr.sign(g_t)
+            area = dr.norm(dr.cross(tangent, facing)) * dr.norm(normal) * dr.norm(view) / dr.abs(g_t)
             turns = [dr.dot(dr.cross(tangent, m), v) for m, v in ((normal, view), (front, facing))]
             forward = dr.sign(turns[0]) * dr.sign(turns[1])
         now = _towards(p[0] + t * D, n[0] + t * N, eye, far)
         follows = t - dr.select(valid, (now - dr.detach(now)) / dr.select(valid, dr.detach(g_t), 1), 0)
         if self.any_grid:
             follows = dr.select(self.is_of_grid(face), t, follows)
-        detached = (dr.detach(v) for v in (tangent, facing, normal, forward))
+        detached = (dr.detach(v) for v in (tangent, facing, normal, front, area, forward))
         return HorizonPoint(mi.Point3f(p[0] + follows * D), *detached, valid)
 
     def is_of_grid(self, face: mi.UInt32) -> mi.Bool:
@@ -221,6 +226,23 @@ class Horizons:
         corners = [dr.gather(mi.UInt32, c, face) for c in self._corners]
         largest = lambda of: dr.maximum(*(dr.gather(mi.Float, of, c) for c in corners[:2]))
         return tuple(dr.maximum(largest(of), dr.gather(mi.Float, of, corners[2])) for of in self._window)
+
+    def weights(self, positions: mi.Float, normals: mi.Float) -> mi.Float:
+        """About how much jumps at the curves of each face, for viewers anywhere: the more, the larger it is, and the
+        farther the normals of its vertices are from its own. Detached."""
+        p, n = self._face(positions, normals, dr.arange(mi.UInt32, self.count))
+        front = dr.cross(p[1] - p[0], p[2] - p[0])
+        area, off = dr.norm(front), mi.Float(0)
+        for normal in n:
+            sine = dr.norm(dr.cross(front, normal)) / (area * dr.norm(normal))
+            off = dr.maximum(off, dr.select(dr.isfinite(sine), dr.square(sine), 0))
+        return area * (off + dr.epsilon(mi.Float))
+
+    def meets(self, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active) -> mi.Bool:
+        """Do rays to points of curves meet the faces in which these are? pi : what they meet. Detached."""
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        there = dr.abs_dot(si.n, p - si.p) <= rounding(p, ray.o)
+        return si.is_valid() & there & (si.prim_index == dr.gather(mi.UInt32, self._number, face))
 
     def sees_dark_side(
         self, face: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active
@@ -283,7 +305,7 @@ def _roots(p, n, D, N, eye, far: bool) -> tuple[mi.Float, mi.Float]:
     return C / q, q / A
 
 
-def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -> None:
+def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon, active: mi.Bool | bool = True) -> None:
     """Turn interpolated normals that lie on the horizon of the viewer, but for rounding, to a side of it.
 
     Does nothing to what hides the point of the horizon, nor, beside edges, to normals that face the right side.
@@ -291,7 +313,7 @@ def turn_to_side(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, horizon: Horizon) -
     to_viewer = -ray.d
     cos = dr.dot(si.sh_frame.n, to_viewer)
     there = dr.abs_dot(si.n, horizon.p - si.p) <= rounding(horizon.p, ray.o) + horizon.reach
-    turn = there & si.is_valid() & (horizon.side != 0) & (horizon.on_curve | (horizon.side * cos <= 0))
+    turn = active & there & si.is_valid() & (horizon.side != 0) & (horizon.on_curve | (horizon.side * cos <= 0))
     _turn(si, to_viewer, horizon.side, turn)
 
 

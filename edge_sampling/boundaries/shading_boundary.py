@@ -36,6 +36,7 @@ from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
 from .either_light import chosen_edge, either
 from .from_edges import FromEdge, FromEdges
+from .horizons_at_points import HorizonsAtPoints, turned
 from .indirect_shadows import is_bent, share
 from .lune import Lune, spreads
 from .near_lamps import share_at_first
@@ -65,14 +66,14 @@ class ShadingBoundary:
     Parameters
     ----------
     scene : mi.Scene
-    silhouettes : of all shapes; refitted by the caller.
+    silhouettes : of all shapes; refitted by the caller. horizons : see `Boundaries`.
     moving : the shapes that move. At points that stand still, only the first group of edges matters then; None: all
         edges matter at all points.
     sliding : those over which the lines of their textures move.
     """
 
     _NUMBERS = ("transmits", "glossy", "smooth", "soft", "veils", "emission", "emission_at_first", "several", "crossed")
-    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps", "from_edges")
+    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps", "from_edges", "horizons")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
 
     def __init__(
@@ -81,8 +82,9 @@ class ShadingBoundary:
         silhouettes: Silhouettes,
         moving: list[mi.Shape] | None,
         sliding: Sequence[mi.Shape] = (),
+        horizons: HorizonsAtPoints | None = None,
     ):
-        self.silhouettes = silhouettes
+        self.silhouettes, self.horizons = silhouettes, horizons
         self.geometry = geometry = silhouettes.geometry
         self.moving_shapes = None if moving is None else [pointer(s) for s in moving]
         self.boxes = EmitterBoxes(scene, geometry)
@@ -353,7 +355,7 @@ class ShadingBoundary:
     def _on_faces(self, sample: EdgeSample, outline, y, past, veiled) -> tuple[mi.Bool, Lune]:
         """Where normals that face away are turned; and from where the light comes that only planes of faces hide."""
         soft = ~past & ~veiled & self.silhouettes.only_bends(sample, outline) & spreads(y.bsdf()) & self.soft
-        return ~past | veiled, Lune.between(outline.tangent, outline.normals, soft)
+        return turned(self.horizons, y, ~past | veiled), Lune.between(outline.tangent, outline.normals, soft)
 
     def _shown_by_faces(
         self, tracer: Tracer, point: ShadingPoint, ray, pi, y, hidden, own, sampler, light, emission, lune, veiled
@@ -364,7 +366,7 @@ class ShadingBoundary:
         L = self._radiance(tracer.scene, y, light, active & emission)
         if tracer.scatters(2):
             reflected = active & ~emission
-            beside = reflected if self.smooth else None
+            beside = turned(self.horizons, y, reflected) if self.smooth else None
             scattered = tracer.scattered(ray, pi, point.depth, sampler, reflected, beside, lune)
             L += dr.select(reflected, scattered, 0)
         return L, active

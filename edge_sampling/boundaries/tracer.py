@@ -83,11 +83,13 @@ class Tracer(Protocol):
         beside_outline: mi.Bool | None = None,
         directions: Lune | None = None,
         found: mi.Float | None = None,
+        horizon: Horizon | None = None,
     ) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`.
 
         beside_outline : is it met just inside of its outline? Then interpolated normals that face away are turned.
         directions : where it is active, only light from there need be scattered.
+        horizon : on which side of a horizon this is; None: as it is.
         found : density with which this is found so, over that with which it is by `DeepShadows`: infinite, never.
         """
 

@@ -11,9 +11,6 @@ from rimlight.edge_sampling.geometry.meshes import surfaces
 #: How far the cosine between the normals of faces and vertices may be below 1, without a warning.
 FRINGE = 0.005
 
-#: The same, of what reflects light to other surfaces.
-TURNED = 0.1
-
 
 def coarse_lamps(scene: mi.Scene) -> list[str]:
     """What the derivative lacks of the light that smooth-shaded meshes throw: Mitsuba reckons it with interpolated
@@ -38,15 +35,4 @@ def coarse_meshes(scene: mi.Scene) -> list[str]:
     return [
         f"the derivative lacks what the faces of {listed(coarse)} hide of lamps with a size, while interpolated "
         "normals go on being lit. Give them finer meshes or face normals, or use direct_edge or prb_edge."
-    ]
-
-
-def coarse_reflectors(scene: mi.Scene) -> list[str]:
-    """What the derivative lacks of indirect light: surfaces see where interpolated normals turn away from them, too."""
-    coarse = names(s for s in surfaces(scene) if not s.is_emitter() and fringe(s) > TURNED)
-    if not coarse:
-        return []
-    return [
-        f"the derivative of the light that {listed(coarse)} reflect to other surfaces is off by some per cent: "
-        "where interpolated normals turn away from these surfaces, it jumps. Use finer meshes or face normals."
     ]

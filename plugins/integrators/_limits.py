@@ -29,7 +29,7 @@ from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
-from ._coarse_limits import FRINGE, coarse_lamps, coarse_meshes, coarse_reflectors
+from ._coarse_limits import FRINGE, coarse_lamps, coarse_meshes
 
 #: What perfect mirrors and glass do.
 MIRRORS = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
@@ -110,8 +110,6 @@ def lasting_limits(
         if depths.scatters(1):
             limits += coarse_lamps(scene) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
-    if depths.scatters(2) and from_points and (sppi or any(moving.turning)):
-        limits += coarse_reflectors(scene)
     return (
         *limits,
         *appearance(scene, depths, moving, lined, bisects=from_points),

@@ -34,6 +34,7 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.boundaries.horizons_at_points import HorizonsAtPoints
 from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
@@ -242,13 +243,15 @@ class BoundarySearch:
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
         soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
         edges = self._edges_of(self.geometry)
+        seen = sppi and self.from_points and self.depths.scatters(2)
+        horizons = HorizonsAtPoints.of(self.geometry, moving.turning) if seen and moving.anything else None
         turning, sppi = np.array(moving.turning, bool), sppi if moving.in_space else 0
         film = None
         if on_film.any() or turning.any():
             film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft, turning=turning)
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
-        shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi)
+        shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi, horizons)
         lined = self._textures.shapes(moving.sliding) if self.from_points else ()
         abilities = {"planes": self.planes, "from_points": self.from_points}
         deep = None
@@ -260,8 +263,8 @@ class BoundarySearch:
         slides = Slides.BEHIND_GLASS if glass else Slides.NOTHING
         what = moving.flags, moving.camera, moving.lights
         chains = self._chains(scene, moving, sppi)
-        lights = LightChoice.of(scene)
-        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, lights, deep, lamps)
+        others = LightChoice.of(scene), deep, lamps, horizons
+        return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, *others)
 
     def _chains(
         self, scene: mi.Scene, moving: Moving, sppi: int
@@ -290,7 +293,7 @@ class BoundarySearch:
         return lines if len(lines) else None
 
     def _in_reflected_light(
-        self, scene: mi.Scene, moving: Moving, sppi: int
+        self, scene: mi.Scene, moving: Moving, sppi: int, horizons: HorizonsAtPoints | None
     ) -> tuple[ShadowBoundary | None, ShadingBoundary | None, tuple[IndirectShadows, ...], DividedLight | None]:
         """What samples the edges of which lights and shading points know, as far as it is needed; and the lamps near
         which points know of all edges."""
@@ -310,7 +313,7 @@ class BoundarySearch:
             return None, None, (), None
         shadows, shading, indirect = ShadowBoundary(scene, silhouettes), None, ()
         if self.from_points:
-            shading = ShadingBoundary(scene, silhouettes, shapes, moving.sliding)
+            shading = ShadingBoundary(scene, silhouettes, shapes, moving.sliding, horizons)
             needed = self.depths.scatters(2) or shading.emission_at_first or lamps is not None
             shading = shading if needed else None
             kinds = (IndirectShadows, IndirectBeams) if self.depths.scatters(2) else ()

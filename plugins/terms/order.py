@@ -5,6 +5,7 @@ from __future__ import annotations
 from .bisection import BisectionTerm
 from .faces import FacePlanesTerm
 from .film import FilmTerm
+from .horizons import HorizonsTerm
 from .indirect import IndirectShadowsTerm
 from .interior import InteriorTerm
 from .points import PointsTerm
@@ -20,4 +21,5 @@ TERMS: tuple[Term, ...] = (
     PointsTerm(),
     IndirectShadowsTerm(),
     FacePlanesTerm(),
+    HorizonsTerm(),
 )

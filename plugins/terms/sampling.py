@@ -13,7 +13,7 @@ from rimlight.edge_sampling.refusals import Refusal
 #: interior term has the seed itself: its samples are those of the image.
 SALT = {"film boundary": 0xFFFFFFFF, "shadows from lights": 0xAAAAAAAA, "edges from points": 0x55555555}
 SALT |= {"planes of faces": 0x33333333, "shadows in indirect light": 0x99999999}
-SALT |= {"mirrors and textures": 0x66666666}
+SALT |= {"mirrors and textures": 0x66666666, "horizons from points": 0x22222222}
 SALT |= {"shadows in light from surfaces": 0x88888888, "shadows in indirect light, continued": 0x77777777}
 SALT |= {"light paths": 0xCCCCCCCC, "paths": 0xBBBBBBBB}
 

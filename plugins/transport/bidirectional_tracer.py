@@ -108,7 +108,7 @@ class BidirectionalTracer(PathTracer):
         return Radiance(L, valid)
 
     def scattered(
-        self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None
+        self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None, horizon=None
     ) -> mi.Spectrum:
         by_path = active & directions.active if directions is not None else None
         others = active & ~by_path if by_path is not None else active
@@ -116,6 +116,8 @@ class BidirectionalTracer(PathTracer):
         def turn(si, ray, active):
             if beside_outline is not None:
                 turn_to_viewer(si, ray, active & beside_outline)
+            if horizon is not None:
+                turn_to_side(si, ray, horizon, active)
             if self.fine_mirrors is not None:
                 self.fine_mirrors.turn(si, ray, active)
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
-from rimlight.edge_sampling.boundaries.horizon import turn_to_viewer
+from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.parametrisation import Vicinity
 
@@ -60,6 +60,7 @@ def scattered_light(
     directions: Directions | None = None,
     lights: LightChoice | None = None,
     fine_mirrors: FineMirrors | None = None,
+    horizon: Horizon | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
@@ -68,6 +69,7 @@ def scattered_light(
     directions : see `Scattering.scatter`, for this vertex.
     lights : see `Scattering`.
     fine_mirrors : of which the normals are turned at this vertex.
+    horizon : on which side of the horizon of interpolated normals this vertex is; None: as it is.
 
     Returns
     -------
@@ -81,6 +83,8 @@ def scattered_light(
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         if beside_outline is not None:
             turn_to_viewer(si, vertex.ray, active & beside_outline & (vertex.depth == first))
+        if horizon is not None:
+            turn_to_side(si, vertex.ray, horizon, vertex.depth == first)
         if fine_mirrors is not None:
             fine_mirrors.turn(si, vertex.ray, active & (vertex.depth == first))
         there = directions.where(active & (vertex.depth == first)) if directions is not None else None

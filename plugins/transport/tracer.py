@@ -201,17 +201,18 @@ class PathTracer:
         return ShadingPoint(c.si, c.depth, chosen.β, c.active, *moves, chosen.density, c.turning), c
 
     def scattered(
-        self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None
+        self, ray, pi, depth, sampler, active, beside_outline=None, directions=None, found=None, horizon=None
     ) -> mi.Spectrum:
         """Light that is scattered, by what a ray from a vertex meets, back to this vertex of number `depth`. Detached.
 
         ray, pi : the ray and what it meets. sampler : for the paths beyond. active : mi.Bool, (N,)
         beside_outline : mi.Bool, (N,), is it met just inside of its outline?
         directions : see `Scattering.scatter`, for what the ray meets. found : of no use here, see `Tracer`.
+        horizon : on which side of the horizon of interpolated normals this is; None: as it is.
         """
         one, no = dr.full(mi.Spectrum, 1, dr.width(active)), mi.Bool(False)
         beyond = Vertex(mi.Ray3f(ray), pi, depth + 1, one, mi.Float(1), no, no)
-        turned = beside_outline, directions, self.lights, self.fine_mirrors
+        turned = beside_outline, directions, self.lights, self.fine_mirrors, horizon
         return scattered_light(self.scene, sampler, beyond, self.depths, active, *turned)[0]
 
     def arriving(

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from coarse import COARSE
 from random_scenes import ball
 
 from rimlight.checks import Motion, compare, derivative_image
@@ -93,6 +94,26 @@ def test_backward(name):
     motion.apply(θ)
     image = mi.render(scene, motion.params, integrator=integrator, spp=64, seed=2, seed_grad=1)
     dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
+    assert np.array(dr.grad(θ))[0] == pytest.approx(forward, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("coarse_normals", "prb_edge"), ("coarse_slides", "prb_edge"), ("coarse_camera", "bdpt_edge")],
+)
+def test_horizons_backward(name, kind):
+    """As forward; they are most of what the light that a coarse ball throws on a wall gains."""
+    make, motion, *_ = COARSE[name]
+    scene = make()
+    integrator = mi.load_dict({"type": kind, "max_depth": 3, "sppc": 0, "sppp": 0})
+    integrator.TERMS = tuple(t for t in integrator.TERMS if t.name in ("interior", "horizons from points"))
+    motion, θ = Motion(scene, **motion), mi.Float(0)
+    weight = np.random.default_rng(2).uniform(size=(16, 16, 3)).astype(np.float32)
+    forward = (np.array(derivative_image(scene, integrator, motion, spp=16, seed=1), np.float64) * weight).sum()
+    dr.enable_grad(θ)
+    motion.apply(θ)
+    integrator.render_backward(scene, motion.params, mi.TensorXf(weight), seed=1, spp=16)
+    assert abs(forward) > 0.1
     assert np.array(dr.grad(θ))[0] == pytest.approx(forward, rel=2e-3)
 
 

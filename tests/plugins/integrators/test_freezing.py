@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import beams
 import cases
+import coarse
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -86,6 +87,11 @@ def test_without_meshes(kind, key):
     point = {"type": "point", "position": [2, 3, -1], "intensity": 9.0}
     scene = balls(point if "light" in key else cases.constant())
     assert_frozen_is_unfrozen(scene, mi.load_dict({"type": kind}), key)
+
+
+@pytest.mark.parametrize("key", ["ball.vertex_normals", "ball.vertex_positions"])
+def test_horizons_from_points(key):
+    assert_frozen_is_unfrozen(coarse.beside_wall()(), mi.load_dict({"type": "prb_edge", "max_depth": 3}), key)
 
 
 @pytest.mark.parametrize("seed", [941643, 941650, 941656, 941662])

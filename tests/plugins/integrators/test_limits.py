@@ -223,16 +223,28 @@ def test_fringe_of_coarse_lamps(coarse):
     assert len(found) == coarse and all('"lamp"' in message for message in found)
 
 
-@pytest.mark.parametrize("key", ["vertex_positions", "vertex_normals"])
-@pytest.mark.parametrize(("coarse", "max_depth", "warns"), [(True, 3, True), (True, 2, False), (False, 3, False)])
-def test_indirect_light_of_coarse_meshes(coarse, max_depth, warns, key):
-    """The jump where the normals of a mesh turn away from surfaces, and not from the camera, has no samples."""
-    points, _, _, faces = ball(4 if coarse else 16)
+@pytest.mark.parametrize(
+    ("quads", "max_depth", "key", "samples"),
+    [
+        (4, 3, "vertex_positions", True),
+        (4, 3, "vertex_normals", True),
+        (4, 2, "vertex_positions", False),
+        (16, 3, "vertex_positions", False),
+        (16, 3, "vertex_normals", True),
+    ],
+)
+def test_indirect_light_of_coarse_meshes(quads, max_depth, key, samples):
+    """The jump where the normals of a mesh turn away from surfaces, and not from the camera."""
+    points, _, _, faces = ball(quads)
     thing = cases.mesh("thing", 0.3 * points, faces, normals=True)
     floor = cases.horizontal((0, -0.3, 0), 2, "floor", bsdf=cases.diffuse(0.5))
     scene = cases.scene(sensor=cases.camera(), thing=thing, floor=floor, sky=cases.constant())
-    found = said(scene, f"thing.{key}", kind="prb_edge", max_depth=max_depth)
-    assert any('"thing" reflect to other surfaces' in message for message in found) == warns
+    params = mi.traverse(scene)
+    dr.enable_grad(params[f"thing.{key}"])
+    params.update()
+    plan = mi.load_dict({"type": "prb_edge", "max_depth": max_depth}).plan(scene, spp=1)
+    assert bool(plan.term("horizons from points").samples) == samples
+    assert not any('"thing"' in limit for limit in plan.limits)
 
 
 @pytest.mark.parametrize("distance", [0, 100, 1e4])
