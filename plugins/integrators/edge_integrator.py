@@ -296,7 +296,7 @@ class EdgeIntegrator(ADIntegrator):
         with dr.suspend_grad():
             job = self.job(scene, sensor, spp=spp)
         found, search = job.boundaries, self.search
-        shapes = zip((*search.geometry.meshes, *search.geometry.analytic), found.moving, strict=False)
+        shapes = zip(search.geometry.known, found.moving, strict=False)
         return Plan(
             integrator=self.name,
             moving=names(s for s, moves in shapes if moves),
