@@ -42,6 +42,7 @@ from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
 from sliding_textures import SLIDING, unsampled_lamp
 from touching_lamps import TOUCHING
+from wires import WIRES
 
 from rimlight.checks import FiniteDifferences, Motion, derivative_image, finite_differences
 
@@ -972,6 +973,7 @@ CASES = [
         Case(k, *of, spp=64, runs=8, integrator=upto(depth), reference_spp=4096 if k in LONGER else 1024)
         for k, (*of, depth) in GRIDS.items()
     ),
+    *(Case(k, *of, spp=64, runs=16, integrator=upto(depth), reference_spp=1024) for k, (*of, depth) in WIRES.items()),
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
         for k, of in HIDDEN.items()

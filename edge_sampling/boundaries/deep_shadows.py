@@ -97,7 +97,7 @@ class DeepShadows(ShadowBoundary):
             m = material_point(shadow.ray, shadow.fallen, active).p
             slid = z.p + ω_z * (dr.dot(m - z.p, x.n) / dr.select(active, dr.dot(ω_z, x.n), 1))
             held = start + dr.lerp(slid, m, far) - dr.detach(m)
-            p = self.silhouettes.point(placement, edge.sample, light.y).p
+            p = self.silhouettes.point(placement, edge.sample, light.y, is_light=True).p
             of_edge = turning(edge.lit, p - held, active)
             of_y = turning(edge.lit, material_point(ray, pi, active).p - held, active)
             return -edge.sign * L * (of_edge - beyond * of_y)

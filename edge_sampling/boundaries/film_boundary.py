@@ -9,7 +9,7 @@ length element and the normal join to n dl = (−u'ᵧ, u'ₓ) dt, so that neith
 
 Besides the edges of meshes, the image jumps at the cuts that the sensor's near clipping plane makes through faces and
 through spheres, disks and cylinders, where interpolated normals turn away from the viewer (`horizon.py`), and at the
-outlines of spheres, disks and cylinders.
+outlines of spheres, disks, cylinders and tubes.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class FilmBoundary:
         seams: bool = False,
     ):
         self.lights = lights
-        self.veils = any(lets_rays_through(s) for s in (*geometry.meshes, *geometry.analytic, *geometry.others))
+        self.veils = any(lets_rays_through(s) for s in (*geometry.known, *geometry.others))
         self.outlines = FilmOutlines(geometry, edges, moving, turning, soft=soft, seams=seams)
 
     @property
@@ -183,7 +183,7 @@ class FilmBoundary:
                 n_dl = dr.select(chosen.is_horizon, dr.mulsign(n_dl, dr.dot(n_dl, found.facing)), n_dl)
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
-            aside, reach = self._offset(scene, at, p, chosen)
+            aside, reach = self._offset(scene, at, p, chosen, found)
             n = dr.normalize(n_dl)
             beside, rest, active = self._on_grid(tracer, at, sensor, chosen, found, u, p, (aside + reach) * n, active)
             offset = (aside + rest * reach) * n
@@ -328,11 +328,13 @@ class FilmBoundary:
             reach = dr.select(of_grid, 2 * horizons.window(chosen.face)[0], 0)
         return [Horizon(s, p, on_curve, reach) for s in sides]
 
-    def _offset(self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen) -> tuple[mi.Float, mi.Float]:
+    def _offset(
+        self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen, found: Found
+    ) -> tuple[mi.Float, mi.Float]:
         """How far beside the edge to look, in pixels: just beyond what single precision can tell apart; and how much
         farther an outline or a crease of a grid may be.
 
-        Farther beside grids, spheres, disks and cylinders, which rays meet less precisely.
+        Farther beside grids, spheres, disks, cylinders and tubes, which rays meet less precisely.
         """
         projection, outlines, ulp = at.projection, self.outlines, dr.epsilon(mi.Float) * 2
         imprecise, farther, reach = chosen.is_curve | chosen.is_cut, mi.Float(0), mi.Float(0)
@@ -347,6 +349,8 @@ class FilmBoundary:
         if outlines.horizons is not None and outlines.horizons.any_grid:
             reach = dr.select(chosen.is_horizon, outlines.horizons.window(chosen.face)[0], reach)
             imprecise |= chosen.is_horizon & outlines.horizons.is_of_grid(chosen.face)
+        if outlines.curves is not None:
+            farther = dr.select(chosen.is_curve, found.curve.slack, farther)
         ulps = dr.select(imprecise, 8, 2) * ulp
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         per_unit = projection.pixels_per_unit(projection.film(p))

@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.curves import CurvePoint, Curves
+from rimlight.edge_sampling.geometry.curve_point import CurvePoint
+from rimlight.edge_sampling.geometry.curves import Curves
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import EdgeKind, Edges
 from rimlight.edge_sampling.geometry.grids import grids_of, is_grid, normals
@@ -90,7 +91,7 @@ class Found:
 
 class FilmOutlines:
     """The edges of meshes, the cuts of the near clipping plane through their faces, the horizons of interpolated
-    normals, the curves of analytic shapes, and the cuts through these.
+    normals, the curves of other shapes (see `Curves`), and the cuts through analytic ones.
 
     Parameters
     ----------
@@ -127,7 +128,8 @@ class FilmOutlines:
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
         self.curves = Curves.of(geometry, moving[len(geometry.meshes) :], seams=seams)
-        self.near_cuts = NearCuts(self.curves) if self.curves is not None else None
+        cut = self.curves is not None and self.curves.shapes
+        self.near_cuts = NearCuts(self.curves) if cut else None
         horizons = Horizons(geometry, moving[: len(geometry.meshes)] | turning)
         self.horizons = horizons if len(horizons) else None
         #: How many edges, then cuts through faces, then faces with horizons, then pieces of curves there are, and then
@@ -192,6 +194,7 @@ class FilmOutlines:
             on_film = projection.tangent(c.p, mi.Point3f(c.p + c.tangent), mi.Float(0), lens)
             found.along_film = dr.select(chosen.is_curve, on_film, found.along_film)
             found.valid |= chosen.is_curve & c.valid & (projection.film(c.p).z > projection.near)
+        if self.near_cuts is not None:
             p, along, there = self.near_cuts.point(at.frames, chosen.cut, chosen.along, projection)
             on_film = projection.tangent(p, mi.Point3f(p + along), mi.Float(0), lens)
             found.along_film = dr.select(chosen.is_cut, on_film, found.along_film)
@@ -219,6 +222,7 @@ class FilmOutlines:
                 p = dr.select(chosen.is_edge & curved, on_curve, p)
         if self.curves is not None:
             p = dr.select(chosen.is_curve, self._curve_point(at, chosen, found).p, p)
+        if self.near_cuts is not None:
             on_cut = self.near_cuts.point(at.frames, chosen.cut, chosen.along, at.projection)[0]
             p = dr.select(chosen.is_cut, on_cut, p)
         if self.horizons is not None:
@@ -289,7 +293,9 @@ class FilmOutlines:
             length = projection.clip(a, b).length
             lengths.append(dr.select(possible, length, 0))
         if self.curves is not None:
-            lengths += [self._curve_length(at), self._length_of_cuts(at)]
+            lengths.append(self._curve_length(at))
+        if self.near_cuts is not None:
+            lengths.append(self._length_of_cuts(at))
         return dr.concat(lengths) if len(lengths) > 1 else lengths[0]
 
     def _part_of_crease(self, at: Placed, edge: mi.UInt32) -> mi.Float:

@@ -95,7 +95,7 @@ class ShadingBoundary:
         self.bent_lamps = [mi.ShapePtr(s) for s in lamps if is_bent(s)]
         emitters = scene.emitters()
         #: Do shapes cut through lamps? That is no shadow, which would be found from the lamp.
-        shapes = (*geometry.meshes, *geometry.analytic)
+        shapes = geometry.known
         self.cut_lamps = any(shapes[i].is_emitter() for lines in geometry.lines for i in lines.shapes)
         #: Do lines of textures move over surfaces, and over lamps?
         self.crossed = silhouettes.textures is not None and bool(sliding)

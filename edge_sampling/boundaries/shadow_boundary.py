@@ -178,7 +178,7 @@ class ShadowBoundary:
         self, scene: mi.Scene, placement: Placement, light: LightPoint, edge: LitEdge, shadow: Shadow, met, active
     ) -> tuple[mi.Point3f, mi.Vector3f]:
         """The line from the light past the edge: a point of it, and its direction; attached to both."""
-        p = self.silhouettes.point(placement, edge.sample, light.y, light.far).p
+        p = self.silhouettes.point(placement, edge.sample, light.y, light.far, is_light=True).p
         q = self._follow(scene, light, shadow.onwards, met, active)
         return dr.select(light.far, p, q), dr.select(light.far, -mi.Vector3f(q), p - q)
 
@@ -245,7 +245,7 @@ class ShadowBoundary:
     def _edge_at(self, placement: Placement, light: LightPoint, e: EdgeSample) -> LitEdge:
         """The point of an edge that was sampled, as the light sees it."""
         far, y = light.far, light.y
-        outline = self.silhouettes.point(placement, e, y, far)
+        outline = self.silhouettes.point(placement, e, y, far, is_light=True)
         d = dr.select(far, -mi.Vector3f(y), outline.p - y)
         ω = dr.normalize(d)
         across = dr.normalize(dr.cross(ω, outline.tangent))

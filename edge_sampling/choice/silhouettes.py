@@ -1,4 +1,4 @@
-"""All that can be an outline in a scene: edges of meshes, found by a tree, and the curves of analytic shapes."""
+"""All that can be an outline in a scene: edges of meshes, found by a tree, and the curves of other shapes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Placement:
     """Where shapes are, attached to their motion.
 
     positions : mi.Float, (3 V,), vertices of all meshes, world space.
-    frames : mi.Float, frames of the analytic shapes, see `Curves.frames`; None: there are none.
+    frames : mi.Float, frames of analytic shapes and control points of tubes, see `Curves.frames`; None: there are none.
     """
 
     positions: mi.Float
@@ -47,8 +47,8 @@ class OutlinePoint:
     tangent : mi.Vector3f, dp/dt, where t is the parameter that was sampled. Detached.
     inwards : two vectors from p towards the faces on the two sides of an edge. Detached.
     is_line : is it on a line in which shapes cut through each other? Then both faces go on beyond it.
-    slack : how far from p what is rendered may lie, scene units: 0 but for grids. concave : is it on an edge of a grid
-        that is bent inwards?
+    slack : how far from p what is rendered may lie, scene units: 0 but for grids and tubes. concave : is it on an edge
+        of a grid that is bent inwards?
     slides : is it on a contour, which slides over its surface? crosses : on a line of a texture that does?
     """
 
@@ -148,7 +148,8 @@ class Silhouettes:
         self.groups = len(groups)
         always = _borders(geometry, edges, lamps) | crosses
         self.tree = EdgeTree(geometry, edges, groups, always) if groups else None
-        self.curves = Curves(geometry.analytic, geometry.joints) if geometry.analytic else None
+        others = geometry.analytic or geometry.tubes
+        self.curves = Curves(geometry.analytic, geometry.joints, geometry.tubes) if others else None
         self.centre = self.tree.centre if self.tree is not None else mi.Point3f(0)
 
     def __len__(self) -> int:
@@ -274,6 +275,10 @@ class Silhouettes:
     ) -> mi.Float:
         """How far beside a point p that was sampled to look from x: scene units."""
         aside = beside_edge(p, x)
+        if self.curves is not None and self.curves.tubes is not None:
+            piece = dr.select(sample.edge < self.count, 0, sample.edge - self.count)
+            slack = self.curves.point(placement.frames, piece, sample.t, x).slack
+            aside += dr.select(sample.edge < self.count, 0, slack)
         if self.tree is None:
             return aside
         active = sample.edge < self.count
@@ -287,9 +292,18 @@ class Silhouettes:
         return aside + dr.select(active, farther, 0)
 
     def point(
-        self, placement: Placement, sample: EdgeSample, eye: mi.Point3f, far: mi.Bool | bool = False
+        self,
+        placement: Placement,
+        sample: EdgeSample,
+        eye: mi.Point3f,
+        far: mi.Bool | bool = False,
+        *,
+        is_light: bool = False,
     ) -> OutlinePoint:
-        """The point that was sampled, as seen from `eye`, world space; or at infinity, in the direction `eye`."""
+        """The point that was sampled, as seen from `eye`, world space; or at infinity, in the direction `eye`.
+
+        is_light : do rays go towards the eye, and not from it?
+        """
         if self.tree is not None:
             on_edge = sample.edge < self.count
             index = dr.select(on_edge, sample.edge, 0) if self.curves is not None else sample.edge
@@ -311,17 +325,17 @@ class Silhouettes:
         piece = sample.edge - self.count
         if self.tree is not None:
             piece = dr.select(on_edge, 0, piece)
-        c = self.curves.point(placement.frames, piece, sample.t, eye, far)
+        c = self.curves.point(placement.frames, piece, sample.t, eye, far, is_light=is_light)
         # Where there is none, both sides seem to have a face.
         inwards = (c.inwards, dr.select(c.valid, c.other, -c.inwards))
         no = mi.Bool(False)
-        on_curve = OutlinePoint(c.p, c.tangent, inwards, no, c.slides, mi.Float(0), no, no)
+        on_curve = OutlinePoint(c.p, c.tangent, inwards, no, c.slides, c.slack, no, no)
         if self.tree is None:
             return on_curve
         choose = lambda x, y: dr.select(on_edge, x, y)
         inwards = tuple(choose(x, y) for x, y in zip(point.inwards, on_curve.inwards, strict=True))
         p, tangent = choose(point.p, on_curve.p), choose(point.tangent, on_curve.tangent)
-        slack, concave = dr.select(on_edge, point.slack, 0), point.concave & on_edge
+        slack, concave = dr.select(on_edge, point.slack, c.slack), point.concave & on_edge
         is_line, crosses = point.is_line & on_edge, point.crosses & on_edge
         return OutlinePoint(p, tangent, inwards, is_line, c.slides & ~on_edge, slack, concave, crosses)
 

@@ -1,4 +1,4 @@
-"""Outlines of spheres, disks and cylinders: exact curves, not those of triangles.
+"""Outlines of spheres, disks, cylinders and tubes: exact curves, not those of triangles.
 
 The rim of a disk, and the two of a cylinder, are fixed on their shape, like an open edge. The contour of a sphere, and
 the two lines along which a cylinder turns away, slide over the shape as the viewer moves. This does not matter: the
@@ -6,11 +6,12 @@ motion of a contour across the line of sight is that of the *material* points th
 
 Where rims coincide, as where a disk closes a cylinder, one of them stands for all. It has two faces, like an edge
 between triangles, and moves as both do on average.
+
+Those of tubes are in `tubes.py`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -18,13 +19,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .curve_point import CurvePoint
+from .tubes import Tubes
+
 if TYPE_CHECKING:
     from .meshes import Geometry
 
 
 class CurveKind(IntEnum):
     """CONTOUR : of a sphere. RIM : of a disk. BOTTOM, TOP : rims of a cylinder, at z = 0 and 1 of its own frame. LEFT,
-    RIGHT : its contour lines. SEAM_… : where texture coordinates jump from 1 to 0, which is no outline."""
+    RIGHT : its contour lines. SEAM_… : where texture coordinates jump from 1 to 0, which is no outline. OF_TUBE : see
+    `Tubes`."""
 
     CONTOUR = 0
     RIM = 1
@@ -35,6 +40,7 @@ class CurveKind(IntEnum):
     SEAM_OF_SPHERE = 6
     SEAM_OF_DISK = 7
     SEAM_OF_CYLINDER = 8
+    OF_TUBE = 9
 
 
 #: Curves of the shapes with known outlines, by Mitsuba's names of their classes.
@@ -54,50 +60,42 @@ SEAMS = {
     "Cylinder": CurveKind.SEAM_OF_CYLINDER,
 }
 
+#: Numbers that tell the frame of a shape, and its inverse.
+NUMBERS = 24
+
 #: Every curve is cut into so many pieces of equal parameter.
 PIECES = 16
 
 
-@dataclass
-class CurvePoint:
-    """A point of a curve, as it is seen from somewhere.
-
-    p : mi.Point3f, world space; attached to the motion of its shape.
-    tangent : mi.Vector3f, dp/dt along the piece. Detached.
-    inwards : mi.Vector3f, from p towards the shape. Detached.
-    other : mi.Vector3f, from p towards the second shape, where rims coincide; elsewhere as `inwards`. Detached.
-    slides : mi.Bool, is it on a contour, which slides over its shape?
-    valid : mi.Bool, is there one? A viewer inside of a sphere sees no contour.
-    """
-
-    p: mi.Point3f
-    tangent: mi.Vector3f
-    inwards: mi.Vector3f
-    other: mi.Vector3f
-    slides: mi.Bool
-    valid: mi.Bool
-
-
 class Curves:
-    """The outlines of analytic shapes.
+    """The outlines of analytic shapes, and then of tubes.
 
     Parameters
     ----------
     shapes : of the classes in `CURVES`.
     joints : rims that coincide, see `Geometry.joints`, by the numbers of `shapes`.
-    seams : are the seams of their texture coordinates among them?
+    tubes : of the class `TUBE`.
+    seams : are the seams of the texture coordinates of `shapes` among them?
     """
 
     _OTHER = ("any_joined", "_joined", "_other_kind", "_other_shape")
-    DRJIT_STRUCT = dict.fromkeys(("count", "shapes", "_seams", "_kind", "_shape", *_OTHER))  # for `dr.freeze`
+    _PARTS = ("count", "shapes", "tubes", "_seams", "_first_tube", "_kind", "_shape")
+    DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_OTHER))  # for `dr.freeze`
 
-    def __init__(self, shapes: tuple[mi.Shape, ...], joints: tuple = (), *, seams: bool = False):
+    def __init__(
+        self, shapes: tuple[mi.Shape, ...], joints: tuple = (), tubes: tuple[mi.Shape, ...] = (), *, seams: bool = False
+    ):
         self.shapes, self._seams = shapes, seams
+        #: After the frames of the other shapes come their control points.
+        self.tubes = Tubes(tubes, NUMBERS * len(shapes) // 4) if tubes else None
         curves = [(kind, i) for i, s in enumerate(shapes) for kind in CURVES[s.class_name()]]
         curves += [(SEAMS[s.class_name()], i) for i, s in enumerate(shapes)] if seams else []
         second = {joint[0]: joint[1] for joint in joints}
         left_out = {rim for joint in joints for rim in joint[1:]}
         curves = [c for c in curves if c not in left_out]
+        #: Number of curves that are of no tubes.
+        self._first_tube = len(curves)
+        curves += [(CurveKind.OF_TUBE, 0)] * (self.tubes.count if tubes else 0)
         others = [second.get(c, c) for c in curves]
         #: Number of curves.
         self.count = len(curves)
@@ -113,42 +111,81 @@ class Curves:
     def of(geometry: Geometry, moving: np.ndarray, *, seams: bool = False) -> Curves | None:
         """Those of shapes that move, and of others with which these have a rim in common; None if there are none.
 
-        moving : (S,), bool, of `geometry.analytic`.
+        moving : (S,), bool, of `geometry.analytic`, and then of `geometry.tubes`.
         """
         joints = [joint for joint in geometry.joints if any(moving[i] for _, i in joint)]
-        chosen = sorted({*np.flatnonzero(moving).tolist(), *(i for joint in joints for _, i in joint)})
+        count = len(geometry.analytic)
+        tubes = tuple(t for t, m in zip(geometry.tubes, moving[count:], strict=True) if m)
+        chosen = sorted({*np.flatnonzero(moving[:count]).tolist(), *(i for joint in joints for _, i in joint)})
         number = {i: k for k, i in enumerate(chosen)}
         renumbered = tuple(tuple((kind, number[i]) for kind, i in joint) for joint in joints)
-        return Curves(tuple(geometry.analytic[i] for i in chosen), renumbered, seams=seams) if chosen else None
+        if not chosen and not tubes:
+            return None
+        return Curves(tuple(geometry.analytic[i] for i in chosen), renumbered, tubes, seams=seams)
 
     def __len__(self) -> int:
         """Number of pieces."""
         return self.count * PIECES
 
     def frames(self) -> mi.Float:
-        """`to_world` of all shapes, attached, and its inverse, detached: 24 numbers each, row by row."""
+        """`to_world` of all shapes, attached, and its inverse, detached: 24 numbers each, row by row; and the control
+        points of all tubes, attached."""
         rows = []
         for shape in self.shapes:
             to_world = mi.traverse(shape)["to_world"]
             for m in (to_world.matrix, dr.detach(to_world).inverse().matrix):
                 rows += [mi.Float(m[i, j]) for i in range(3) for j in range(4)]
+        if self.tubes is not None:
+            rows.append(self.tubes.control_points())
         return dr.concat(rows)
 
     def centre(self, frames: mi.Float, curve: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
-        """Centre and radius of a ball around the shape of a curve. Detached."""
+        """Centre and radius of a ball around the shape of a curve, or around the segment of a tube. Detached."""
+        if self.tubes is None:
+            return self._ball(frames, curve)
+        on_tube, of_tube, of_shape = self._numbers(curve)
+        ball = self.tubes.ball(frames, of_tube)
+        return dr.select(on_tube, ball, self._ball(frames, of_shape)) if self.shapes else ball
+
+    def _numbers(self, curve: mi.UInt32) -> tuple[mi.Bool, mi.UInt32, mi.UInt32]:
+        """Is it a curve of a tube? Its number among these, and among all others; 0 where it is none."""
+        on_tube = curve >= self._first_tube
+        return on_tube, dr.select(on_tube, curve - self._first_tube, 0), dr.select(on_tube, 0, curve)
+
+    def _ball(self, frames: mi.Float, curve: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
         x, y, z, o = self._columns(dr.detach(frames), curve, 0)
         is_cylinder = dr.gather(mi.UInt32, self._kind, curve) >= int(CurveKind.BOTTOM)
         middle = mi.Point3f(o + dr.select(is_cylinder, 0.5 * z, 0))
         return middle, dr.sqrt(dr.squared_norm(x) + dr.squared_norm(y) + dr.squared_norm(z))
 
     def point(
-        self, frames: mi.Float, piece: mi.UInt32, t: mi.Float, eye: mi.Point3f, far: mi.Bool | bool = False
+        self,
+        frames: mi.Float,
+        piece: mi.UInt32,
+        t: mi.Float,
+        eye: mi.Point3f,
+        far: mi.Bool | bool = False,
+        *,
+        is_light: bool = False,
     ) -> CurvePoint:
-        """The point t in [0, 1) of a piece, as seen from `eye`, world space; or at infinity, in the direction `eye`."""
-        curve = piece // PIECES
+        """The point t in [0, 1) of a piece, as seen from `eye`, world space; or at infinity, in the direction `eye`.
+
+        is_light : do rays go towards the eye, and not from it?
+        """
+        curve, v = piece // PIECES, (piece % PIECES + t) / PIECES
+        if self.tubes is None:
+            return self._on_shape(frames, curve, v, eye, far)
+        on_tube, of_tube, of_shape = self._numbers(curve)
+        point = self.tubes.point(frames, of_tube, v, eye, far, is_light)
+        point.tangent /= PIECES
+        return dr.select(on_tube, point, self._on_shape(frames, of_shape, v, eye, far)) if self.shapes else point
+
+    def _on_shape(
+        self, frames: mi.Float, curve: mi.UInt32, v: mi.Float, eye: mi.Point3f, far: mi.Bool | bool
+    ) -> CurvePoint:
+        """The point v in [0, 1) of a curve that is of no tube."""
         kind = dr.gather(mi.UInt32, self._kind, curve)
         with dr.suspend_grad():
-            v = (piece % PIECES + t) / PIECES
             x, y, z, o = self._columns(frames, curve, 12)
             e = mi.Vector3f(dr.detach(eye))
             e = x * e.x + y * e.y + z * e.z + dr.select(far, mi.Vector3f(0), o)
@@ -188,10 +225,10 @@ class Curves:
             to_world = lambda w: x * w.x + y * w.y + z * w.z
             tangent, inwards = to_world(tangent) / PIECES, to_world(inwards)
         if not self.any_joined:
-            return CurvePoint(p, tangent, inwards, inwards, contour | side, valid)
+            return CurvePoint(p, tangent, inwards, inwards, contour | side, valid, mi.Float(0))
         joined, q, other = self._of_second(frames, curve, dr.detach(p))
         p, other = dr.select(joined, 0.5 * (p + q), p), dr.select(joined, other, inwards)
-        return CurvePoint(p, tangent, inwards, other, contour | side, valid)
+        return CurvePoint(p, tangent, inwards, other, contour | side, valid, mi.Float(0))
 
     def _of_second(self, frames: mi.Float, curve: mi.UInt32, p: mi.Point3f) -> tuple[mi.Bool, mi.Point3f, mi.Vector3f]:
         """Do rims coincide at points p? Where these are as the second shape moves, and the direction towards that."""
@@ -212,6 +249,8 @@ class Curves:
 
     def misses(self, frames: mi.Float, piece: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
         """Is the piece on a rim of a cylinder, beyond whose contour the ray goes?"""
+        if not self.shapes:
+            return mi.Bool(False)
         curve = piece // PIECES
         kind = dr.gather(mi.UInt32, self._kind, curve)
         x, y, z, o = self._columns(frames, curve, 12)
@@ -230,7 +269,7 @@ class Curves:
     def columns(frames: mi.Float, shape: mi.UInt32, start: int = 0) -> list[mi.Vector3f]:
         """Images of the axes, and of the origin, of the shapes with these numbers; by `to_world`, or, from 12 on, by
         its inverse."""
-        first = shape * 24 + start
+        first = shape * NUMBERS + start
         return [mi.Vector3f(*(dr.gather(mi.Float, frames, first + 4 * i + j) for i in range(3))) for j in range(4)]
 
 

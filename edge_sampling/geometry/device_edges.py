@@ -71,7 +71,7 @@ class DeviceEdges:
         #: The curves among them, which come first.
         self.curves = self._lines[0] if self._lines and not self._lines[0].straight else None
         self._first_line = int(np.argmax(edges.is_line)) if self._any_lines else 0
-        shapes = (*geometry.meshes, *geometry.analytic, *geometry.others)
+        shapes = (*geometry.known, *geometry.others)
         #: Is there a surface that lets rays through?
         self._any_through = any(lets_rays_through(s) for s in shapes)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())

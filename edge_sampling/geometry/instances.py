@@ -31,6 +31,7 @@ from .meshes import (
     tells_shapes_in_groups,
     texcoords_of,
 )
+from .tubes import TUBE, slide_on_tube
 
 #: An instance is flat if its smallest stretch is below this, relative to its largest.
 FLAT = 1e-5
@@ -184,12 +185,14 @@ def surface_met(
 
     Mitsuba 3.9 knows how the points of an instance move, but not how its normals and texture coordinates change. And of
     an instance that moves, it does not know either what the motion of the ray does to them. For grids whose values
-    change, see `slide_on_grid`.
+    change, see `slide_on_grid`, and for tubes `slide_on_tube`.
     """
     si = pi.compute_surface_interaction(ray, flags, active)
     for shape in scene.shapes():
         if shape.class_name() == "SDFGrid" and not flags & mi.RayFlags.FollowShape and has_changing_values(shape):
             slide_on_grid(si, ray, pi, flags, active & si.is_valid() & (pi.shape == mi.ShapePtr(shape)))
+        if shape.class_name() == TUBE and not flags & mi.RayFlags.FollowShape:
+            slide_on_tube(shape, si, ray, pi, active & si.is_valid() & (pi.shape == mi.ShapePtr(shape)))
         if shape.class_name() == "Instance" and _moves(shape) and dr.grad_enabled(matrix_of(shape), ray.o, ray.d):
             on_shape = active & si.is_valid() & (pi.instance == mi.ShapePtr(shape))
             _attach(si, mi.AffineTransform4f(matrix_of(shape, on_shape)), ray, pi, flags, on_shape)

@@ -15,10 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.refusals import Refusal
-
 from .curves import CURVES
-from .parameters import Parameter
+from .tubes import TUBE
 
 #: Interpolated normals are those of a face if the sine of the angle between them is at most so large.
 BENT = 1e-3
@@ -34,8 +32,9 @@ class Geometry:
     meshes : triangle meshes (also `rectangle`, `cube` and merged shapes), whose edges are known; and what stands for
         such: see `Instances` and `Grids`.
     analytic : spheres, disks, cylinders, whose outlines are known curves.
-    others : all else (hair, ...; instances and grids, until theirs are found). They occlude and receive light, but
-        must not move.
+    tubes : b-spline curves, whose outlines are known curves, too.
+    others : all else (linear curves, ...; instances and grids, until theirs are found). They occlude and receive light,
+        but must not move.
     lines : in which shapes cut through each other (`CutCurves`, `Intersections`), whose vertices then come after those
         of the meshes.
     joints : rims of analytic shapes that coincide (`Rims`).
@@ -44,6 +43,7 @@ class Geometry:
 
     meshes: tuple[Any, ...]
     analytic: tuple[Any, ...] = ()
+    tubes: tuple[Any, ...] = ()
     others: tuple[Any, ...] = ()
     lines: tuple[Any, ...] = ()
     joints: tuple[Any, ...] = ()
@@ -54,8 +54,14 @@ class Geometry:
         shapes = scene.shapes()
         meshes = tuple(s for s in shapes if s.is_mesh() and s.class_name() != "EllipsoidsMesh")
         analytic = tuple(s for s in shapes if s.class_name() in CURVES)
-        known = {id(s) for s in (*meshes, *analytic)}
-        return Geometry(meshes, analytic, tuple(s for s in shapes if id(s) not in known))
+        tubes = tuple(s for s in shapes if s.class_name() == TUBE)
+        known = {id(s) for s in (*meshes, *analytic, *tubes)}
+        return Geometry(meshes, analytic, tubes, tuple(s for s in shapes if id(s) not in known))
+
+    @property
+    def known(self) -> tuple[Any, ...]:
+        """All shapes whose outlines are known."""
+        return (*self.meshes, *self.analytic, *self.tubes)
 
     @property
     def _all_lines(self) -> tuple[Any, ...]:
@@ -77,27 +83,10 @@ class Geometry:
         return np.concatenate(chosen) if chosen else np.zeros((0, 3), np.uint32)
 
     def moving(self) -> tuple[bool, ...]:
-        """For every mesh, and then for every analytic shape: does it move?"""
+        """For each of the `known` shapes: does it move?"""
         meshes = tuple(is_moving(m) for m in self.meshes)
-        return meshes + tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
-
-    def refuse_moving_others(self, changing: list[Parameter], who: str) -> None:
-        """Refuse derivatives with respect to shapes whose silhouettes are not known, inside of shape groups, too.
-
-        changing : the parameters of the scene that carry a gradient.
-
-        Raises
-        ------
-        RuntimeError : one of `others`, or a shape in a group, carries a gradient in one of its own parameters.
-        """
-        known = {int(s.ptr) for s in (*self.meshes, *self.analytic)}
-        for name, node, *_ in changing:
-            if isinstance(node, mi.Shape) and int(node.ptr) not in known:
-                raise Refusal(
-                    f'{who}: shape "{node.id()}" ({node.class_name()}) moves ("{name}" carries a gradient), but its '
-                    "silhouettes cannot be sampled: only triangle meshes, spheres, disks and cylinders outside of "
-                    "shape groups can move, and instances of meshes. Replace it by such a mesh, or detach it."
-                )
+        analytic = tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
+        return meshes + analytic + tuple(dr.grad_enabled(mi.traverse(s)["control_points"]) for s in self.tubes)
 
     def positions(self) -> mi.Float:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""

@@ -1,5 +1,5 @@
-"""Spheres, disks and cylinders that cut through hair, and grids that cut through anything: in curves, whose jumps are
-not sampled."""
+"""Spheres, disks and cylinders that cut through hair, and grids and tubes that cut through anything: in curves, whose
+jumps are not sampled."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from .device_edges import rounding
 from .grids import grids_of
 from .meshes import Geometry, faces, is_met, number_of, vertices
+from .tubes import lines_along
 
 #: Lines over a shape, in each of two directions, along which others are sought.
 LINES = 24
@@ -30,6 +31,16 @@ def cuts_of_grids(scene: mi.Scene, geometry: Geometry) -> list[tuple[mi.Shape, m
             p = vertices(grid)[np.unique(np.sort(sides, axis=1), axis=0)]
             numbers = set(_first_met(scene, grid.inner, p[:, 0], p[:, 1]).tolist())
             found += [(grid.inner, s) for s in scene.shapes() if number_of(s) in numbers]
+    return found
+
+
+def cuts_of_tubes(scene: mi.Scene, geometry: Geometry) -> list[tuple[mi.Shape, mi.Shape]]:
+    """Tubes, each with another shape that cuts through it. On the host; what is much thinner may be missed."""
+    found = []
+    with dr.suspend_grad():
+        for tube in geometry.tubes:
+            numbers = set(_first_met(scene, tube, *lines_along(tube)).tolist())
+            found += [(tube, s) for s in scene.shapes() if number_of(s) in numbers]
     return found
 
 

@@ -1,5 +1,5 @@
 """What derivatives lack where the far clipping plane of a sensor cuts through shapes, in words for the user. (Cuts of
-the near one are sampled.)"""
+the near one are sampled, but those through tubes.)"""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from rimlight._plan import listed, names
 from rimlight.edge_sampling import film_parts
 from rimlight.edge_sampling.geometry.meshes import vertices
+from rimlight.edge_sampling.geometry.tubes import TUBE
 
 
 def cut_by_clipping_planes(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
@@ -20,21 +21,21 @@ def cut_by_clipping_planes(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[st
     limits = []
     for part in film_parts(sensor):
         if hasattr(part.sensor, "far_clip"):
-            limits += beyond_far_plane(part.sensor, shapes)
+            limits += cut_by_planes(part.sensor, shapes)
     return limits
 
 
-def beyond_far_plane(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
+def cut_by_planes(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
     """Of one sensor."""
     far, to_local = sensor.far_clip(), dr.detach(sensor.world_transform()).inverse().matrix
     axis = np.array([to_local[2, k] for k in range(4)], np.float64).ravel()
-    cut = names(s for s in shapes if _crosses(s, axis, far))
-    if not cut:
-        return []
-    return [
-        f'the derivative lacks the cut of the far clipping plane of "{sensor.id()}" through {listed(cut)}; '
-        f"increase its far_clip, now {far:g}."
-    ]
+    lacks = 'the derivative lacks the cut of the {} clipping plane of "{}" through {}; {} its {}_clip, now {:g}.'
+    limits, near = [], sensor.near_clip()
+    tubes = [s for s in shapes if s.class_name() == TUBE]
+    for which, cure, among, depth in (("far", "increase", shapes, far), ("near", "decrease", tubes, near)):
+        cut = names(s for s in among if _crosses(s, axis, depth))
+        limits += [lacks.format(which, sensor.id(), listed(cut), cure, which, depth)] if cut else []
+    return limits
 
 
 def _crosses(shape: mi.Shape, axis: np.ndarray, depth: float) -> bool:

@@ -21,10 +21,11 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.grids import grids_of
-from rimlight.edge_sampling.geometry.meshes import has_normal_map, lets_rays_through, surfaces, vertices
-from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, inner, lets_rays_through, surfaces, vertices
+from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others, cuts_of_tubes
 from rimlight.edge_sampling.geometry.texture_edges import COARSE
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP, lattices
+from rimlight.edge_sampling.geometry.tubes import steepest
 from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
@@ -46,7 +47,7 @@ PARTIAL = {
 class Moving:
     """What moves.
 
-    known : the shapes that can: meshes, then analytic shapes. flags : do they? camera, lights : do these?
+    known : the shapes that can, as `Geometry.known` has them. flags : do they? camera, lights : do these?
     mapped : shapes whose normal maps or bump maps change, or the index of whose glass, or their texture coordinates.
     sliding : those whose texture coordinates do.
     turning : does a mesh have vertex normals that change? Those that move do not count.
@@ -277,7 +278,7 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"the derivative is noisy, and off by up to a fifth, in what {listed(shiny)} (sdfgrid) show, perfect "
             "mirrors or glass that move. Give them a roughness, or replace them by meshes."
         )
-    turned = names(s for s in moving.known if not has_its_inverse(s))
+    turned = names(s for s in moving.known if s not in geometry.tubes and not has_its_inverse(s))
     if turned:
         limits.append(
             f'the derivative is wrong for {listed(turned)}: the inverse of "to_world" is not the one that Mitsuba '
@@ -291,6 +292,7 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             "the derivative lacks the curves in which spheres, disks and cylinders cut through shapes that are neither "
             f"such nor meshes: {pairs}. Replace them by meshes."
         )
+    limits += of_tubes(scene, geometry, moving)
     pairs = [f'"{a.id()}" and "{b.id()}"' for a, b in cuts_of_grids(scene, geometry)]
     if pairs:
         limits.append(
@@ -309,6 +311,29 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f"units wide: {pairs}. Join the vertices there, or move them farther apart."
         )
     return limits
+
+
+def of_tubes(scene: mi.Scene, geometry: Geometry, moving: Moving) -> list[str]:
+    """What lacks at the outlines of tubes, as b-spline curves are."""
+    limits = []
+    moves = lambda s: s in moving.on_film or inner(s) in (inner(m) for m in moving.shapes)
+    cut = sorted(f'"{a.id()}" and "{b.id()}"' for a, b in cuts_of_tubes(scene, geometry) if moves(a) or moves(b))
+    if cut:
+        limits.append(
+            f"the derivative lacks the curves in which b-spline curves cut through other shapes: {listed(cut)}. "
+            "Replace them by meshes, or move them apart."
+        )
+    steep = names(s for s in geometry.tubes if steepest(s) > STEEP) if moving.in_space else ()
+    if steep:
+        limits.append(
+            f"the derivative lacks part of the outlines of {listed(steep)}, where they are seen from their thin "
+            f"end, almost along them: rays miss them there. Let their radius grow by at most {STEEP:g} per length."
+        )
+    return limits
+
+
+#: How much the radius of tubes may grow per length.
+STEEP = 0.05
 
 
 def has_its_inverse(shape: Any) -> bool:

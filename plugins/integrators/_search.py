@@ -117,7 +117,7 @@ class BoundarySearch:
             self._media.refuse_gradients(self.who)
             limits = (*self._media.limits(), *self._partial.limits())
             changing = [p for p in found if dr.grad_enabled(p.value)]
-            geometry.refuse_moving_others(changing, self.who)
+            self._refuse_moving_others(geometry, changing)
             moving = self._what_moves(scene, sensor, geometry, changing)
         if not moving.anything:
             return Boundaries(limits=limits)
@@ -207,7 +207,7 @@ class BoundarySearch:
                 f"{self.who}: the camera moves past {names}, whose silhouettes cannot be sampled yet. "
                 "Replace them by meshes."
             )
-        shapes = (*geometry.meshes, *geometry.analytic)
+        shapes = geometry.known
         lamps = any(s.is_emitter() and m for s, m in zip(shapes, moves, strict=True))
         others = [] if only_shapes else [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.Surface]
         others = [mi.traverse(e) for e in others]
@@ -219,6 +219,20 @@ class BoundarySearch:
         return Moving(shapes, moves, camera, lights, tuple(dict.fromkeys((*mapped, *sliding))), sliding, turning)
 
     # ---------------------- Boundaries ----------------------
+
+    def _refuse_moving_others(self, geometry: Geometry, changing: list[Parameter]) -> None:
+        """Refuse derivatives with respect to shapes whose silhouettes are not known, inside of shape groups, too.
+
+        changing : the parameters of the scene that carry a gradient.
+        """
+        known = {int(s.ptr) for s in geometry.known}
+        others = [p for p in changing if isinstance(p.node, mi.Shape) and int(p.node.ptr) not in known]
+        for name, shape, *_ in others:
+            raise Refusal(
+                f'{self.who}: shape "{shape.id()}" ({shape.class_name()}) moves ("{name}" carries a gradient), but its '
+                "silhouettes cannot be sampled: only triangle meshes, spheres, disks, cylinders and b-spline curves "
+                "outside of shape groups can move, and instances of meshes. Replace it by such a mesh, or detach it."
+            )
 
     def _refuse_instances(self, moving: Moving) -> None:
         """Refuse instances that move, and are perfect mirrors or glass: how what they show slides is not known; and

@@ -45,10 +45,10 @@ class DirectEdgeIntegrator(EdgeIntegrator):
     **Memory.** A derivative has at most 2¹⁸ samples of a term in memory (2²¹ on a GPU), but at least one per pixel.
     More are taken in passes. In Python, ``integrator.at_once`` is that number.
 
-    **Limits.** Only triangle meshes and their instances, spheres, disks and cylinders can move: moving hair is refused,
-    and so is a camera that moves past one. Missing, with a warning: the curves in which spheres, disks and
-    cylinders cut through such shapes, cuts of the far clipping plane through any, and shadows of hair, ... on
-    what moves. Warned about, too: participating
+    **Limits.** Only triangle meshes and their instances, spheres, disks, cylinders, grids of signed distances and
+    b-spline curves can move: a moving ``linearcurve`` is refused, and so is a camera that moves past one. Missing, with
+    a warning: the curves in which grids and curves cut through other shapes, cuts of the far clipping plane through
+    any, and shadows of ``linearcurve``, ... on what moves. Warned about, too: participating
     media, which are taken for empty (derivatives with respect to their parameters are refused). So is the light of
     smooth-shaded lamps with coarse meshes, which is off by some per cent. Polarised variants are refused. With
     filters other than ``box``, the ratio of sums that makes a pixel has a bias of order 1/spp, as it has in the

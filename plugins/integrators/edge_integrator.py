@@ -302,7 +302,7 @@ class EdgeIntegrator(ADIntegrator):
         with dr.suspend_grad():
             job = self._job(scene, sensor, 0, spp, dr.ADMode.Primal)
         found, search = job.boundaries, self.search
-        shapes = zip((*search.geometry.meshes, *search.geometry.analytic), found.moving, strict=False)
+        shapes = zip(search.geometry.known, found.moving, strict=False)
         return Plan(
             integrator=self.name,
             moving=names(s for s, moves in shapes if moves),

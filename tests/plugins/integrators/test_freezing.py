@@ -12,6 +12,7 @@ import polished
 import pytest
 import random_scenes
 import touching_lamps
+import wires
 from frozen import (
     Step,
     assert_frozen_is_unfrozen,
@@ -46,6 +47,8 @@ VALUES = [
     ("window", "sensor.to_world"),
     ("bulb", "ball.to_world"),
     ("polished", "floor.vertex_positions"),
+    ("wires", "wires.control_points"),
+    ("wires", "sensor.to_world"),
 ]
 SCENES = {
     "two_triangles": cases.two_triangles,
@@ -59,6 +62,7 @@ SCENES = {
     "window": touching_lamps.window,
     "bulb": touching_lamps.bulb,
     "polished": polished.floor,
+    "wires": wires.before_wall(wires.sun),
     "fisheye": cases.room(cases.fisheye),
     "batch": cases.room(cases.batch),
 }

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import sliding_textures
+import wires
 from random_scenes import ball
 
 import rimlight
@@ -273,6 +274,22 @@ def test_analytic_shapes_that_cut_hair_are_warned_about(kind, height, tmp_path):
         shapes = {"thing": thing, "floor": floor, **others}
         found = said(cases.scene(sensor=cases.camera(), **shapes, sky=cases.constant()), "thing.to_world")
         assert any("cut through shapes" in message and '"hair"' in message for message in found) == warned
+
+
+@pytest.mark.parametrize(
+    ("down", "grows", "text"),
+    [(1.2, 0, '"wires" and "floor"'), (0, 0.1, "seen from their thin end"), (0, 0, "")],
+)
+def test_what_is_said_of_wires(down, grows, text):
+    scene = wires.before_wall(cases.constant)()
+    params = mi.traverse(scene)
+    points = np.array(params["wires.control_points"]).reshape(-1, 4)
+    points[:, 1] -= down
+    points[0, 3] += grows
+    params["wires.control_points"] = mi.Float(points.ravel())
+    params.update()
+    found = said(scene, "wires.control_points")
+    assert any(text in message for message in found) if text else not found
 
 
 SKIES = {

@@ -263,7 +263,7 @@ CELLS = {
     "`bsplinecurve`": Cell(lambda name, place, folder: curve("bsplinecurve", folder, place), shape=True),
     "`linearcurve`": Cell(lambda name, place, folder: curve("linearcurve", folder, place), shape=True),
 }
-ANALYTIC = ("`sphere`", "`disk`", "`cylinder`")
+ANALYTIC = ("`sphere`", "`disk`", "`cylinder`", "`bsplinecurve`")
 PIXELS = 8
 VOXELS = "thing.bsdf.brdf_0.reflectance.volume.data"
 
@@ -784,10 +784,7 @@ def second_sensor(kind: str, moves: str = "") -> Message:
 #: By row, what is said when it moves, and when it is passed.
 #: By row, or by row and column where the columns differ.
 MESSAGES = {
-    "`bsplinecurve`, `linearcurve`": [
-        Message(
-            lambda folder: {"thing": curve("bsplinecurve", folder, np.zeros(3))}, SILHOUETTES, "thing.control_points"
-        ),
+    "`linearcurve`": [
         Message(
             lambda folder: {"thing": curve("linearcurve", folder, np.zeros(3))}, SILHOUETTES, "thing.control_points"
         ),
@@ -825,6 +822,9 @@ ELSEWHERE = {
     "`sdfgrid`": [
         "grid_slides", "grid_slides_gaussian", "grid_grows", "grid_lamp", "grid_along_axis", "grid_of_flat_normals",
         "grid_that_ends",
+    ],
+    "`bsplinecurve`": [
+        "wires_slide", "wires_swell", "wires_bend", "wires_camera", "wires_lamp", "wires_indirect",
     ],
     "`merge`": [test_merged_shapes_equal_their_parts],
     "`instance` of meshes": ["chair_slides", "chair_turns", "stretched_ball", test_something_passes_an_instance],
