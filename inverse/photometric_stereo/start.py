@@ -47,7 +47,8 @@ def method(data: Dataset, level: Dataset, size: float, options: Options) -> tupl
     It is that of the options, from all values, unless some are clipped. Then it may be from those that are not clipped,
     or not dark either; and least squares from these, for what is too bright is known then. But few may be left, or
     those in shadow. So a fifth of the lights after the other is left out, and what predicts their values best is taken,
-    if it is better than the first by more than the standard error of this difference.
+    if it is better than the first by more than the standard error of this difference: of the pixels and of the lights,
+    for deviations that all pixels have in common under one light say as much as one.
     """
     given = options.start, None
     if not data.clipped.any() or level.values.shape[1] <= least_squares.FEWEST:
@@ -61,7 +62,7 @@ def method(data: Dataset, level: Dataset, size: float, options: Options) -> tupl
     mean = np.maximum(values.mean(1, keepdims=True), 1e-30)
 
     def off(name: str, used: np.ndarray | None) -> np.ndarray:
-        total = np.zeros(len(pixels))
+        each = np.zeros(values.shape)
         for part in range(PARTS):
             out = np.arange(values.shape[1]) % PARTS == part
             lights = directions[..., ~out, :]
@@ -70,14 +71,15 @@ def method(data: Dataset, level: Dataset, size: float, options: Options) -> tupl
             predicted = np.maximum(least_squares.predicted(b, directions[..., out, :]), 0)
             more = predicted - values[:, out]
             more[over[pixels][:, out] & (more > 0)] = 0  # what is clipped may have been brighter
-            total += (lit[pixels][:, out] * np.minimum(np.abs(more) / mean, MOST)).sum(1)
-        return total
+            each[:, out] = lit[pixels][:, out] * np.minimum(np.abs(more) / mean, MOST)
+        return each
 
     first = off(*given)
     names = dict.fromkeys((options.start, "least squares"))
     gains = {(name, k): first - off(name, used) for name in names for k, used in enumerate(usable)}
-    (name, k), gain = max(gains.items(), key=lambda item: item[1].mean())
-    return (name, usable[k]) if gain.mean() > gain.std() / np.sqrt(len(pixels)) else given
+    (name, k), gain = max(gains.items(), key=lambda item: item[1].sum())
+    error = np.sqrt(sum(total.size * total.var() for total in (gain.sum(0), gain.sum(1))))
+    return (name, usable[k]) if gain.sum() > error else given
 
 
 def check(data: Dataset) -> None:
