@@ -12,7 +12,7 @@ from scipy import ndimage
 from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
-from . import calibration, least_squares
+from . import calibration, glossy, least_squares
 from .dataset import ALL_BLACK, Dataset
 from .direct import DirectModel, Guess
 from .rendering import Domain, unlit
@@ -102,18 +102,29 @@ def check(data: Dataset) -> None:
         )
 
 
-def scale(data: Dataset, options: Options) -> float:
+def scale(data: Dataset, lobes: ggx.Lobes, options: Options) -> float:
     """By which values are multiplied, so that albedos are those of real things."""
     if not options.brightness:
         return 1.0
-    directions, irradiance = flat(data).lighting()
+    plane = flat(data)
+    directions, irradiance = plane.lighting()
     b = [
         least_squares.trimmed(least_squares.as_at_infinity(data.values[..., c], irradiance), directions)
         for c in range(3)
     ]
     median = max(np.median(np.linalg.norm(x, axis=1)) for x in b)
-    # Where more than half of the pixels are black, nothing tells it
-    return options.brightness / np.pi / median if median > 0 else 1.0
+    if not median > 0:  # where more than half of the pixels are black, nothing tells it
+        return 1.0
+    found = options.brightness / np.pi / median
+    if np.isnan(lobes.alpha).all():
+        return found
+    pixels = np.unique(np.linspace(0, len(data.values) - 1, JUDGED).astype(int))
+    values = least_squares.as_at_infinity(data.luminance, irradiance)[pixels]
+    counts = least_squares.brightest(values, options.dark)
+    # Of metal, little is diffuse, and highlights would need weights of lobes that sum to more than 1
+    needed = np.median(glossy.search(found * values, counts, plane.mean_directions())[1])
+    eta = np.nanmax(lobes.eta)
+    return found / max(needed * ((eta + 1) / (eta - 1)) ** 2, 1)
 
 
 def flat(data: Dataset) -> DirectModel:
@@ -149,6 +160,13 @@ def guess(
     colour = (data.values / exposures[:, None]).mean((0, 1)) / (data.luminance / exposures).mean()
     weights[np.isnan(lobes.eta)] = np.minimum(np.pi * np.median(albedo) * colour, 1)
     return Guess(normals, np.ones(len(values)), exposures, weights)
+
+
+def glossy_guess(data: Dataset, counts: np.ndarray, guess: Guess) -> Guess:
+    """Another one, with the normals of a glossy surface."""
+    plane = flat(data)
+    values = least_squares.as_at_infinity(data.luminance, plane.lighting()[1]) / guess.exposures
+    return replace(guess, normals=glossy.search(values, counts, plane.mean_directions())[0])
 
 
 def refined(guess: Guess, domain: Domain, data: Dataset, *, before: int, now: int) -> Guess:
