@@ -23,13 +23,13 @@ BLOCK = 500
 
 def search(values: np.ndarray, counts: np.ndarray, lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals, (P, 3), a few degrees off those that explain the values best; and the weights of the glossy lobes
-    with them, (P,), of a Fresnel factor of 1.
+    with them, (P,), of a Fresnel factor of 1. Pixels that are black face the camera.
 
     values, counts : (P, K), and how much they count. lights : (K, 3), directions. The camera is towards +z.
     """
     tried = spiral(NORMALS, SPREAD)
     diffuse, lobes = _shapes(tried, lights)
-    normals, weights = np.empty((len(values), 3)), np.empty(len(values))
+    normals, weights = np.tile([0.0, 0, 1], (len(values), 1)), np.zeros(len(values))
     for i in range(0, len(values), BLOCK):
         v = values[i : i + BLOCK].astype(np.float64)
         w = counts[i : i + BLOCK] / (np.maximum(v, 0) + DARK * v.mean(1, keepdims=True) + np.finfo(np.float32).tiny)

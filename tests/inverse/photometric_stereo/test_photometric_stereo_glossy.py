@@ -60,6 +60,16 @@ def test_values_that_do_not_count_do_not() -> None:
     assert angles(found, normals).mean() < 3 and angles(wrong, normals).mean() > 4
 
 
+def test_black_pixels_face_the_camera() -> None:
+    """Or the values or the lights that count are none: nothing divides by 0."""
+    values, counts = shown(spiral(4, 30), 0.1, 0.3, 0.2), np.ones((4, 40))
+    values[1], counts[2] = 0, 0
+    with np.errstate(all="raise"):
+        found, weights = glossy.search(values, counts, LIGHTS)
+    assert np.isfinite(found).all() and np.isfinite(weights).all()
+    assert (found[1:3] == [0, 0, 1]).all() and (weights[1:3] == 0).all() and (weights[[0, 3]] > 0).all()
+
+
 def test_metal_is_reconstructed(metal: Dataset) -> None:
     """Whatever its brightness is taken to be. Its start is kept if alternations begin from it only."""
     options = ps.Options(resolutions=(1.0,), iterations=(2,), materials="one", coat=False)
