@@ -540,11 +540,11 @@ def test_materials_begin_from_glossy_normals_if_they_are_better() -> None:
     state = lambda left_out, halves, **what: alternation.State(
         None, None, Kind(), left_out=left_out, halves=halves, curl=10.0, **what
     )
-    for glossy, better in ((state(0.18, 8.0), True), (state(0.3, 10.0), False)):
+    for found, better in ((state(0.18, 8.0), True), (state(0.3, 10.0), False)):
         begun = state(0.17, 14.0, start=True)
         now = progress.Progress(kind=Kind(), start=begun)
         now.end_trial(begun)
-        now.end_trial(glossy, settles=True)
-        assert now.settled is (glossy if better else begun) and now.best is begun
+        now.end_trial(found, settles=True)
+        assert now.settled is (found if better else begun) and now.best is begun
         now.end_trial(state(0.1, 5.0))
-        assert now.settled is (glossy if better else begun) and now.best is not begun
+        assert now.settled is (found if better else begun) and now.best is not begun

@@ -68,8 +68,8 @@ def numbers(out: Path) -> dict:
 
 
 def test_killed_runs_resume_bit_by_bit(folder: Path, tmp_path: Path) -> None:
-    """In a fit from the normals of a glossy surface, and with the second kind of material; and at the larger size, while
-    a checkpoint is written."""
+    """In a fit from the normals of a glossy surface, and in one with the second kind of material; and at the larger
+    size, while a checkpoint is written."""
     (tmp_path / "run.py").write_text(SCRIPT)
 
     def run(out: str, *more: str, end: str = "whole", last: int = -1) -> None:
