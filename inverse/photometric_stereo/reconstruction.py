@@ -84,9 +84,9 @@ class Options:
     bilateral: float | None = None
     """Sharpness of discontinuities of depth; see `integrate`."""
     brightness: float = 0.6
-    """Albedo of the brightest colour of a median pixel. It sets the unknown scale of the images, on which the
-    interreflections depend. 0: the scale is known, and values are radiances under lights of irradiance 1 (times
-    intensity)."""
+    """Albedo of the brightest colour of a median pixel; of metal it is less, so that lobes explain its highlights. It
+    sets the unknown scale of the images, on which the interreflections depend. 0: the scale is known, and values are
+    radiances under lights of irradiance 1 (times intensity)."""
     seed: int = 0
     """Random seed."""
 
@@ -278,7 +278,7 @@ class Reconstruction:
             if now.start is None:
                 view = self._begin(most, coarse)
             elif now.course is None and glossy:
-                guess = start.glossy_guess(level, judge.counts, now.start.guess)
+                guess = start.glossy_guess(level, self.lobes, judge.counts, now.start.guess)
                 now.course = Course(State(guess, self.work.integrate(guess), kind, left_out=np.inf), most)
             elif now.course is None:
                 # Of another kind, never the best as it is: its judge fits the material, but its normals are not fitted

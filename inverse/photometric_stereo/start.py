@@ -26,6 +26,9 @@ log = logging.getLogger(__name__)
 #: Pixels without which there is no surface.
 FEWEST = 9
 
+#: Fits of albedos and of the BSDF, in turns, to the normals of a glossy surface.
+SETTLING = 4
+
 #: Pixels from which it is told whether clipped values are of use, at most, and parts of the lights that are left out
 #: in turns for that. Deviations count at most so much, of the mean value of the pixel.
 JUDGED, PARTS, MOST = 1000, 5, 0.5
@@ -162,11 +165,20 @@ def guess(
     return Guess(normals, np.ones(len(values)), exposures, weights)
 
 
-def glossy_guess(data: Dataset, counts: np.ndarray, guess: Guess) -> Guess:
-    """Another one, with the normals of a glossy surface."""
+def glossy_guess(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, guess: Guess) -> Guess:
+    """Another one, with the normals of a glossy surface and the material that explains the values with them."""
     plane = flat(data)
     values = least_squares.as_at_infinity(data.luminance, plane.lighting()[1]) / guess.exposures
-    return replace(guess, normals=glossy.search(values, counts, plane.mean_directions())[0])
+    normals = glossy.search(values, counts, plane.mean_directions())[0]
+    # Beside a diffuse material, highlights would be outliers, and stay so: begin with all glossy lobes
+    weights = np.repeat(~np.isnan(lobes.alpha)[:, None] / len(lobes), 3, axis=1)
+    found = replace(guess, normals=normals, albedo=np.ones(len(normals)), weights=weights)
+    model = DirectModel(data, lobes, points=np.array(plane.points).reshape(-1, 3), counts=counts)
+    for _ in range(SETTLING):
+        model.fit_normals(found, steps=1, turn=False)
+        found.albedo /= np.median(found.albedo)
+        model.fit_bsdf(found, np.random.default_rng(0), turn=False)
+    return found
 
 
 def refined(guess: Guess, domain: Domain, data: Dataset, *, before: int, now: int) -> Guess:
