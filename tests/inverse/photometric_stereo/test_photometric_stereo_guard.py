@@ -223,6 +223,7 @@ def test_a_coat_is_put_on_colours_and_taken_off() -> None:
 
 
 def test_of_another_material_only_what_was_fitted_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And from the normals of a glossy surface; of the same material, what was there before is kept."""
     begun = []
     run = alternation.Alternations.run
 
@@ -240,7 +241,7 @@ def test_of_another_material_only_what_was_fitted_is_kept(matte: Dataset, monkey
         guess, self.integrate(guess), self.kind, 99.0, start=True), None))  # fmt: skip
     monkeypatch.setattr(alternation.Alternations, "run", noted)
     ps.reconstruct(matte, ps.Options(**QUICK, materials="one"), progress=False)
-    assert begun[1:] == [(False, True), (True, False)]
+    assert begun[1:] == [(False, False), (False, True), (True, False)]
 
 
 def test_each_state_has_the_interreflections_of_the_one_before(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
