@@ -39,8 +39,10 @@ class Progress:
     """Where a reconstruction is; all of it is in a checkpoint, but for random numbers.
 
     level : number of the size of the images. kind : of the material with which its alternations begin.
-    trial : which alternations of this size: 0 with that kind, then those of other kinds of material.
-    start : of this size, judged. settled : result of trial 0. best : of the trials that ended. course : of this trial.
+    trial : which alternations of this size: 0 with that kind, then, of the first size, from normals of a glossy
+        surface, then those of other kinds of material.
+    start : of this size, judged. settled : result of trial 0, or of the glossy one if that is better.
+    best : of the trials that ended. course : of this trial.
     back : part of the surface that was taken back to the start at the end.
     history, seconds : as of `Result`.
     """
@@ -56,9 +58,11 @@ class Progress:
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
 
-    def end_trial(self, found: State) -> None:
+    def end_trial(self, found: State, *, settles: bool = False) -> None:
+        """settles : others begin from it, if its predictions and halves together are better."""
         self.best = self._chosen(found)
-        self.settled = self.settled or found
+        if self.settled is None or (settles and found.better_than(self.settled)):
+            self.settled = found
         self.trial, self.course = self.trial + 1, None
 
     def next_level(self, kind: Kind) -> None:

@@ -31,8 +31,9 @@ from .progress import Checkpoint, Progress
 from .refinement import Descent, descend
 from .rendering import Rendering
 
-#: Alternations of each kind of material, from the best state of the simplest: with the normals of the start, anything
-#: may look like a coat. And at the largest size, of the same kind with a coat, or without: small pixels show it better.
+#: Alternations from the normals of a glossy surface; of each kind of material, from the best state of the simplest, for
+#: with the normals of the start, anything may look like a coat. And at the largest size, of the same kind with a coat,
+#: or without: small pixels show it better.
 SETTLED, RECONSIDERED = 3, 2
 
 #: Longest path, as of the plugin `rig`.
@@ -83,9 +84,9 @@ class Options:
     bilateral: float | None = None
     """Sharpness of discontinuities of depth; see `integrate`."""
     brightness: float = 0.6
-    """Albedo of the brightest colour of a median pixel. It sets the unknown scale of the images, on which the
-    interreflections depend. 0: the scale is known, and values are radiances under lights of irradiance 1 (times
-    intensity)."""
+    """Albedo of the brightest colour of a median pixel; of metal it is less, so that lobes explain its highlights. It
+    sets the unknown scale of the images, on which the interreflections depend. 0: the scale is known, and values are
+    radiances under lights of irradiance 1 (times intensity)."""
     seed: int = 0
     """Random seed."""
 
@@ -126,7 +127,8 @@ class Options:
         """Alternations that compare kinds of material: at the smallest size, and at the largest."""
         kinds = self.kinds()
         again = len(self.resolutions) > 1 and len({kind.coat for kind in kinds}) > 1
-        return SETTLED * len(kinds) if len(kinds) > 1 else 0, RECONSIDERED if again else 0
+        glossy = SETTLED if self.reflectance else 0
+        return glossy + (SETTLED * len(kinds) if len(kinds) > 1 else 0), RECONSIDERED if again else 0
 
 
 @dataclass
@@ -223,7 +225,7 @@ class Reconstruction:
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
         self.rng = np.random.default_rng(options.seed)
-        self.scale = start.scale(self.data.at(options.resolutions[0]), options)
+        self.scale = start.scale(self.data.at(options.resolutions[0]), self.lobes, options)
         self.now = Progress(kind=self.kinds[0])
         self.file: Checkpoint | None = None
         self.work: Alternations | None = None
@@ -263,22 +265,26 @@ class Reconstruction:
         method = start.method(self.data, level, size, options)
         judge = Judge(level, self.lobes, left_out(level, options.seed), counts, options.seed, *method)
         # With too few lights to judge by, the start is kept, and one alternation tells how far it is off the images
-        plan = [(now.kind, options.iterations[now.level] if judge.able else 1)]
-        if now.level == 0 and judge.able and len(self.kinds) > 1:
-            plan += [(kind, SETTLED) for kind in self.kinds]
+        plan = [(now.kind, options.iterations[now.level] if judge.able else 1, False)]
+        if now.level == 0 and judge.able and options.reflectance:
+            plan += [(now.kind, SETTLED, True)]
+            plan += [(kind, SETTLED, False) for kind in self.kinds if len(self.kinds) > 1]
         elif now.level == len(options.resolutions) - 1 and judge.able:
             same = (kind for kind in self.kinds if kind.several == now.kind.several and kind != now.kind)
-            plan += [(kind, RECONSIDERED) for kind in same]
-        for kind, most in plan[now.trial :]:
+            plan += [(kind, RECONSIDERED, False) for kind in same]
+        for kind, most, glossy in plan[now.trial :]:
             view, self.work = None, None  # of Dr.Jit's scenes one at a time
             self.work = Alternations(level, self.lobes, kind, judge, options, self.rng)
             if now.start is None:
                 view = self._begin(most, coarse)
+            elif now.course is None and glossy:
+                guess = start.glossy_guess(level, self.lobes, judge.counts, now.start.guess)
+                now.course = Course(State(guess, self.work.integrate(guess), kind, left_out=np.inf), most)
             elif now.course is None:
                 # Of another kind, never the best as it is: its judge fits the material, but its normals are not fitted
                 unknown = np.nan if kind == now.settled.kind else np.inf
                 now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=unknown), most)
-            now.end_trial(self.work.run(now.course, self._record, view))
+            now.end_trial(self.work.run(now.course, self._record, view), settles=glossy)
         if now.level == len(options.resolutions) - 1:
             self._take_back()
         return self._result()

@@ -23,7 +23,7 @@ from rimlight.loading import one_line
 from . import dataset
 from .dataset import Dataset
 from .integration import mesh_of, normals_of
-from .vectors import unit
+from .vectors import spiral, unit
 
 #: File of the true depth.
 TRUE_DEPTH = "Depth_gt.exr"
@@ -189,14 +189,6 @@ def write(folder: Path, data: Dataset, depth: np.ndarray, options: Options) -> N
     write_exr(
         folder / TRUE_DEPTH, {"": np.nan_to_num(depth)[..., None]}, {"unit": "pixels where the object begins", **header}
     )
-
-
-def spiral(count: int, spread: float) -> np.ndarray:
-    """Directions, (count, 3), evenly spread over the cap about +z of this half-angle, degrees (Fibonacci spiral)."""
-    k = np.arange(count)
-    z = 1 - (k + 0.5) / count * (1 - np.cos(np.radians(spread)))
-    phi, r = k * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], 1)
 
 
 # ---------------------- Shapes ----------------------

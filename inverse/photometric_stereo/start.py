@@ -12,7 +12,7 @@ from scipy import ndimage
 from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
-from . import calibration, least_squares
+from . import calibration, glossy, least_squares
 from .dataset import ALL_BLACK, Dataset
 from .direct import DirectModel, Guess
 from .rendering import Domain, unlit
@@ -25,6 +25,9 @@ log = logging.getLogger(__name__)
 
 #: Pixels without which there is no surface.
 FEWEST = 9
+
+#: Fits of albedos and of the BSDF, in turns, to the normals of a glossy surface.
+SETTLING = 4
 
 #: Pixels from which it is told whether clipped values are of use, at most, and parts of the lights that are left out
 #: in turns for that. Deviations count at most so much, of the mean value of the pixel.
@@ -47,7 +50,8 @@ def method(data: Dataset, level: Dataset, size: float, options: Options) -> tupl
     It is that of the options, from all values, unless some are clipped. Then it may be from those that are not clipped,
     or not dark either; and least squares from these, for what is too bright is known then. But few may be left, or
     those in shadow. So a fifth of the lights after the other is left out, and what predicts their values best is taken,
-    if it is better than the first by more than the standard error of this difference.
+    if it is better than the first by more than the standard error of this difference: of the pixels and of the lights,
+    for deviations that all pixels have in common under one light say as much as one.
     """
     given = options.start, None
     if not data.clipped.any() or level.values.shape[1] <= least_squares.FEWEST:
@@ -61,7 +65,7 @@ def method(data: Dataset, level: Dataset, size: float, options: Options) -> tupl
     mean = np.maximum(values.mean(1, keepdims=True), 1e-30)
 
     def off(name: str, used: np.ndarray | None) -> np.ndarray:
-        total = np.zeros(len(pixels))
+        each = np.zeros(values.shape)
         for part in range(PARTS):
             out = np.arange(values.shape[1]) % PARTS == part
             lights = directions[..., ~out, :]
@@ -70,14 +74,15 @@ def method(data: Dataset, level: Dataset, size: float, options: Options) -> tupl
             predicted = np.maximum(least_squares.predicted(b, directions[..., out, :]), 0)
             more = predicted - values[:, out]
             more[over[pixels][:, out] & (more > 0)] = 0  # what is clipped may have been brighter
-            total += (lit[pixels][:, out] * np.minimum(np.abs(more) / mean, MOST)).sum(1)
-        return total
+            each[:, out] = lit[pixels][:, out] * np.minimum(np.abs(more) / mean, MOST)
+        return each
 
     first = off(*given)
     names = dict.fromkeys((options.start, "least squares"))
     gains = {(name, k): first - off(name, used) for name in names for k, used in enumerate(usable)}
-    (name, k), gain = max(gains.items(), key=lambda item: item[1].mean())
-    return (name, usable[k]) if gain.mean() > gain.std() / np.sqrt(len(pixels)) else given
+    (name, k), gain = max(gains.items(), key=lambda item: item[1].sum())
+    error = np.sqrt(sum(total.size * total.var() for total in (gain.sum(0), gain.sum(1))))
+    return (name, usable[k]) if gain.sum() > error else given
 
 
 def check(data: Dataset) -> None:
@@ -100,18 +105,29 @@ def check(data: Dataset) -> None:
         )
 
 
-def scale(data: Dataset, options: Options) -> float:
+def scale(data: Dataset, lobes: ggx.Lobes, options: Options) -> float:
     """By which values are multiplied, so that albedos are those of real things."""
     if not options.brightness:
         return 1.0
-    directions, irradiance = flat(data).lighting()
+    plane = flat(data)
+    directions, irradiance = plane.lighting()
     b = [
         least_squares.trimmed(least_squares.as_at_infinity(data.values[..., c], irradiance), directions)
         for c in range(3)
     ]
     median = max(np.median(np.linalg.norm(x, axis=1)) for x in b)
-    # Where more than half of the pixels are black, nothing tells it
-    return options.brightness / np.pi / median if median > 0 else 1.0
+    if not median > 0:  # where more than half of the pixels are black, nothing tells it
+        return 1.0
+    found = options.brightness / np.pi / median
+    if np.isnan(lobes.alpha).all():
+        return found
+    pixels = np.unique(np.linspace(0, len(data.values) - 1, JUDGED).astype(int))
+    values = least_squares.as_at_infinity(data.luminance, irradiance)[pixels]
+    counts = least_squares.brightest(values, options.dark)
+    # Of metal, little is diffuse, and highlights would need weights of lobes that sum to more than 1
+    needed = np.median(glossy.search(found * values, counts, plane.mean_directions())[1])
+    eta = np.nanmax(lobes.eta)
+    return found / max(needed * ((eta + 1) / (eta - 1)) ** 2, 1)
 
 
 def flat(data: Dataset) -> DirectModel:
@@ -147,6 +163,22 @@ def guess(
     colour = (data.values / exposures[:, None]).mean((0, 1)) / (data.luminance / exposures).mean()
     weights[np.isnan(lobes.eta)] = np.minimum(np.pi * np.median(albedo) * colour, 1)
     return Guess(normals, np.ones(len(values)), exposures, weights)
+
+
+def glossy_guess(data: Dataset, lobes: ggx.Lobes, counts: np.ndarray, guess: Guess) -> Guess:
+    """Another one, with the normals of a glossy surface and the material that explains the values with them."""
+    plane = flat(data)
+    values = least_squares.as_at_infinity(data.luminance, plane.lighting()[1]) / guess.exposures
+    normals = glossy.search(values, counts, plane.mean_directions())[0]
+    # Beside a diffuse material, highlights would be outliers, and stay so: begin with all glossy lobes
+    weights = np.repeat(~np.isnan(lobes.alpha)[:, None] / len(lobes), 3, axis=1)
+    found = replace(guess, normals=normals, albedo=np.ones(len(normals)), weights=weights)
+    model = DirectModel(data, lobes, points=np.array(plane.points).reshape(-1, 3), counts=counts)
+    for _ in range(SETTLING):
+        model.fit_normals(found, steps=1, turn=False)
+        found.albedo /= np.median(found.albedo)
+        model.fit_bsdf(found, np.random.default_rng(0), turn=False)
+    return found
 
 
 def refined(guess: Guess, domain: Domain, data: Dataset, *, before: int, now: int) -> Guess:

@@ -23,3 +23,11 @@ def directions_of(vectors: np.ndarray) -> np.ndarray:
 def every(array: np.ndarray, most: int) -> np.ndarray:
     """At most so many rows of an array, evenly."""
     return array[:: -(-len(array) // most) or 1]
+
+
+def spiral(count: int, spread: float) -> np.ndarray:
+    """Directions, (count, 3), evenly spread over the cap about +z of this half-angle, degrees (Fibonacci spiral)."""
+    k = np.arange(count)
+    z = 1 - (k + 0.5) / count * (1 - np.cos(np.radians(spread)))
+    phi, r = k * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], 1)

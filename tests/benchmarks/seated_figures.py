@@ -1,4 +1,5 @@
-"""Figures like those that people photograph: a seated person with folds, glazed in three colours or matte in two.
+"""Figures like those that people photograph: a seated person with folds, glazed in three colours, matte in two, or of
+one metallic paint or two.
 
     python tests/benchmarks/seated_figures.py glazed matte --seeds 1 2 --size 170
 
@@ -31,6 +32,8 @@ from rimlight.inverse.photometric_stereo.vectors import unit
 KINDS = {
     "glazed": "glaze:0.03,0.04,0.18|glaze:0.75,0.72,0.68|glaze:0.7,0.4,0.3",
     "matte": "diffuse:0.5,0.4,0.3|diffuse:0.25,0.2,0.16",
+    "metal": "silver-metallic-paint",
+    "metals": "gold-metallic-paint|alum-bronze",
 }
 
 #: Width of the grid from which meshes are made; lights; their distance, and that of the camera, in widths of the image.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from photometric import LAMBERT, Scene, bowl, near_ball
 
+from rimlight import ggx
 from rimlight.inverse.photometric_stereo import reconstruction, start
 from rimlight.inverse.photometric_stereo.dataset import angles
 
@@ -79,7 +80,8 @@ def test_the_median_pixel_has_the_brightness_that_is_asked_for(exposure: float, 
     albedo = np.where(np.arange(len(scene.guess.albedo)) % 3, 1.0, 0.1)
     values = exposure * scene.model().predicted(dataclasses.replace(scene.guess, albedo=albedo))
     data = dataclasses.replace(scene.data, values=values)
-    found = start.scale(data, reconstruction.Options(brightness=brightness))
+    lobes = ggx.read_dictionary()[0]
+    found = start.scale(data, lobes, reconstruction.Options(brightness=brightness))
     assert found == pytest.approx(brightness / (0.7 * exposure), rel=1e-3)
 
 
@@ -87,13 +89,15 @@ def test_scale_under_near_lights() -> None:
     """It is known as well as the distance is: the surface is taken for a plane."""
     scene = near_ball(LAMBERT, np.array([[0.3, 0.5, 0.4]]), 1000.0, K=20)
     data = dataclasses.replace(scene.data, values=scene.model().predicted(scene.guess))
-    assert start.scale(data, reconstruction.Options(brightness=0.6)) == pytest.approx(0.6 / 0.5, rel=0.05)
+    lobes = ggx.read_dictionary()[0]
+    assert start.scale(data, lobes, reconstruction.Options(brightness=0.6)) == pytest.approx(0.6 / 0.5, rel=0.05)
 
 
 def test_scales_that_are_known_or_that_nothing_tells() -> None:
     scene = bowl(K=16, spread=20)
     values = 3 * scene.model().predicted(scene.guess)
     data = dataclasses.replace(scene.data, values=values)
-    assert start.scale(data, reconstruction.Options(brightness=0)) == 1
+    lobes = ggx.read_dictionary()[0]
+    assert start.scale(data, lobes, reconstruction.Options(brightness=0)) == 1
     values[: len(values) // 2 + 2] = 0
-    assert start.scale(dataclasses.replace(data, values=values), reconstruction.Options(brightness=0.6)) == 1
+    assert start.scale(dataclasses.replace(data, values=values), lobes, reconstruction.Options(brightness=0.6)) == 1

@@ -223,6 +223,7 @@ def test_a_coat_is_put_on_colours_and_taken_off() -> None:
 
 
 def test_of_another_material_only_what_was_fitted_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And from the normals of a glossy surface; of the same material, what was there before is kept."""
     begun = []
     run = alternation.Alternations.run
 
@@ -240,7 +241,7 @@ def test_of_another_material_only_what_was_fitted_is_kept(matte: Dataset, monkey
         guess, self.integrate(guess), self.kind, 99.0, start=True), None))  # fmt: skip
     monkeypatch.setattr(alternation.Alternations, "run", noted)
     ps.reconstruct(matte, ps.Options(**QUICK, materials="one"), progress=False)
-    assert begun[1:] == [(False, True), (True, False)]
+    assert begun[1:] == [(False, False), (False, True), (True, False)]
 
 
 def test_each_state_has_the_interreflections_of_the_one_before(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,10 +274,10 @@ def test_the_coat_is_reconsidered_at_the_largest_size(matte: Dataset, monkeypatc
     options = ps.Options(resolutions=(0.5, 1.0), iterations=(1, 1), max_depth=2, brightness=0.0, materials="one")
     ps.reconstruct(matte, options, progress=False)
     assert [(kind, most) for size, kind, most in made if size == N // 2] == [
-        (Kind(), 1), (Kind(), 3), (Kind(coat=True), 3)]  # fmt: skip
+        (Kind(), 1), (Kind(), 3), (Kind(), 3), (Kind(coat=True), 3)]  # fmt: skip
     kinds = [kind for size, kind, _ in made if size == N]
     assert sorted(kind.coat for kind in kinds) == [False, True]
-    assert options.others() == (6, 2) and cost.seconds(100, 12, options) > 0
+    assert options.others() == (9, 2) and cost.seconds(100, 12, options) > 0
 
 
 def test_background_in_the_mask(matte: Dataset, caplog: pytest.LogCaptureFixture) -> None:
@@ -533,3 +534,18 @@ def test_beside_the_start_no_material_costs_more() -> None:
     assert now.best.kind == now.best_so_far().kind == several
     now.end_trial(state(0.0815, 7.54, kind=Kind(True, True)))
     assert now.best.kind == several
+
+
+def test_materials_begin_from_glossy_normals_if_they_are_better() -> None:
+    """In predictions and halves together, also where the start is kept until then."""
+    state = lambda left_out, halves, **what: alternation.State(
+        None, None, Kind(), left_out=left_out, halves=halves, curl=10.0, **what
+    )
+    for found, better in ((state(0.18, 8.0), True), (state(0.3, 10.0), False)):
+        begun = state(0.17, 14.0, start=True)
+        now = progress.Progress(kind=Kind(), start=begun)
+        now.end_trial(begun)
+        now.end_trial(found, settles=True)
+        assert now.settled is (found if better else begun) and now.best is begun
+        now.end_trial(state(0.1, 5.0))
+        assert now.settled is (found if better else begun) and now.best is not begun

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import random_photometric
 
-from rimlight.inverse.photometric_stereo import simulation
+from rimlight import ggx
+from rimlight.inverse.photometric_stereo import simulation, start
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 
 
@@ -50,3 +51,15 @@ def test_a_seed_is_a_set() -> None:
 def test_no_set_ends_worse_than_it_starts(seed: int) -> None:
     row = random_photometric.run(seed)
     assert row.holds, str(row)
+
+
+@pytest.mark.parametrize("seed", [8287, 8408])
+def test_starts_of_clipped_images_ask_lights(seed: int) -> None:
+    """Of which pixels all predict a few lights better with least squares, but not the lights on the whole: these sets,
+    of which less than 2 % of the values are clipped, keep the method that is given, which is better."""
+    data, options, _ = random_photometric.make(seed)
+    counts, lobes = start.counts(data, data, 1.0, options.dark), ggx.Lobes((np.nan,), (np.nan,))
+    given = options.start, None
+    error = lambda of: angles(start.guess(data, lobes, counts, options, of).normals, data.truth).mean()
+    assert 0 < data.clipped.mean() < 0.02 and start.method(data, data, 1.0, options) == given
+    assert error(given) < 0.8 * error(("least squares", ~data.clipped))

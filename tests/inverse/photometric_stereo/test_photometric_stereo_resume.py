@@ -68,7 +68,8 @@ def numbers(out: Path) -> dict:
 
 
 def test_killed_runs_resume_bit_by_bit(folder: Path, tmp_path: Path) -> None:
-    """In a fit with the second kind of material; and at the larger size, while a checkpoint is written."""
+    """In a fit from the normals of a glossy surface, and in one with the second kind of material; and at the larger
+    size, while a checkpoint is written."""
     (tmp_path / "run.py").write_text(SCRIPT)
 
     def run(out: str, *more: str, end: str = "whole", last: int = -1) -> None:
@@ -80,11 +81,13 @@ def test_killed_runs_resume_bit_by_bit(folder: Path, tmp_path: Path) -> None:
 
     made = lambda: checkpoint.load(tmp_path / "killed" / "checkpoint.npz")[1]
     run("whole")
-    assert [entry["size"] for entry in numbers(tmp_path / "whole")["history"]] == [0.5] * 4 + [1.0] * 2
-    run("killed", end="fitting", last=4)
-    assert len(made()["history"]) == 3 and made()["trial"] == 1
+    assert [entry["size"] for entry in numbers(tmp_path / "whole")["history"]] == [0.5] * 5 + [1.0] * 2
+    run("killed", end="fitting", last=3)
+    assert len(made()["history"]) == 2 and made()["trial"] == 0
+    run("killed", "--resume", end="fitting", last=3)
+    assert len(made()["history"]) == 4 and made()["trial"] == 2
     run("killed", "--resume", end="writing", last=3)
-    assert len(made()["history"]) == 5 and made()["level"] == 1
+    assert len(made()["history"]) == 6 and made()["level"] == 1
     assert list((tmp_path / "killed").glob(".checkpoint.*"))  # half of one
     (tmp_path / "killed" / ".normals.123.exr").write_text("half of another file")
     run("killed", "--resume")
