@@ -551,6 +551,12 @@ def cylinder_over(*lamps: Callable[[], dict]) -> Callable[[], mi.Scene]:
     return lambda: over_floor({**thing, "bsdf": diffuse(0.5, two_sided=True)}, lamps)
 
 
+def thin_cylinder() -> mi.Scene:
+    """Of a hundredth of its distance: in single precision, rays just inside of its outline miss it."""
+    thing = {"type": "cylinder", "p0": [-1.2, -0.8, 0.3], "p1": [0.8, 0.9, -0.2], "radius": 0.04, "id": "thing"}
+    return scene(sensor=camera(), thing={**thing, "bsdf": diffuse(0.8)}, lamp=sun(), sky=constant(0.1))
+
+
 def over_floor(thing: dict, lamps: tuple[Callable[[], dict], ...]) -> mi.Scene:
     """A shape above a floor, lit by the lamps."""
     return scene(
@@ -889,6 +895,7 @@ CASES = [
     Case("cylinder_sun_turn", cylinder_over(sun), THING_TURN, 6e-3),
     Case("cylinder_soft", cylinder_over(ceiling_light), THING_SIDE, 1e-2, runs=24),
     Case("cylinder_camera", cylinder_over(ceiling_light), CAMERA_X, 6e-3, runs=24),
+    Case("thin_cylinder", thin_cylinder, THING_SIDE, 6e-3, runs=24, spp=256),
     Case("sphere_light", sphere_light, LAMP_SIDE, 2e-2, spp=128, runs=24),
     # What random scenes found, in its simplest form.
     Case(

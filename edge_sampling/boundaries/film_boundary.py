@@ -190,7 +190,7 @@ class FilmBoundary:
             rays, weights = _beside(at, sensor, sampler, beside, offset, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
             active &= self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, met)
-            horizons = self._sides_of_horizons(at, chosen, found, p, rays)
+            horizons = self._sides_of_horizons(at, chosen, found, p, rays, met)
             n_dl = dr.select(active, n_dl * found.forward, 0)
             shared = self._lune(at, chosen, lights, p, rays, met)
             if tracer.shares_directions:
@@ -309,24 +309,37 @@ class FilmBoundary:
                     jumps &= ~joined | there | ((sign * faces[0] < 0) & (sign * faces[1] < 0))
         return jumps
 
-    def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays) -> list[Horizon | None]:
-        """On which side of a horizon of interpolated normals each of two rays is."""
-        horizons = self.outlines.horizons
-        if horizons is None:
+    def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays, met) -> list[Horizon | None]:
+        """On which side of a horizon of interpolated normals each of two rays is. A contour is such a horizon, too: of
+        thin shapes, normals turn much between it and where rays surely meet the shape."""
+        horizons, curves = self.outlines.horizons, self.outlines.curves
+        if horizons is None and curves is None:
             return [None, None]
         side, reach, on_curve = mi.Float(0), mi.Float(0), chosen.is_horizon
-        if self.outlines.edges is not None:
+        if horizons is not None and self.outlines.edges is not None:
             # Where a curve runs between the two rays beside an edge, its jump is not that of the edge.
             sight = line_of_sight(p, rays)
             side = self.outlines.edges.facing(at.normals, horizons.sign, chosen.edge, found.t, -sight)
             side = dr.select(chosen.is_edge & self.outlines.edges.is_fold(at.positions, chosen.edge, p, sight), side, 0)
         sides = [dr.select(on_curve, mi.Float(sign), side) for sign in (-1, 1)]
-        if horizons.any_grid:
+        if horizons is not None and horizons.any_grid:
             # Where smooth normals turn away just inside of an outline, both jumps count as one.
             of_grid = on_curve & horizons.is_of_grid(chosen.face)
             sides, on_curve = [dr.select(of_grid, 1, s) for s in sides], on_curve & ~of_grid
             reach = dr.select(of_grid, 2 * horizons.window(chosen.face)[0], 0)
+        if curves is not None:
+            contour = chosen.is_curve & found.curve.slides
+            si = [
+                pi.compute_surface_interaction(r, mi.RayFlags.Minimal, contour) for r, pi in zip(rays, met, strict=True)
+            ]
+            facing = [-dr.sign(dr.dot(hit.n, ray.d)) for hit, ray in zip(si, rays, strict=True)]
+            sides = [dr.select(contour, f, s) for f, s in zip(facing, sides, strict=True)]
+            reach, on_curve = dr.select(contour, 2 * self._blur(at, chosen, found), reach), on_curve | contour
         return [Horizon(s, p, on_curve, reach) for s in sides]
+
+    def _blur(self, at: Placed, chosen: Chosen, found: Found) -> mi.Float:
+        """How far beside a curve rays from the sensor may find its shape: scene units."""
+        return found.curve.slack + self.outlines.curves.blur(at.frames, chosen.piece, at.projection.eye())
 
     def _offset(
         self, scene: mi.Scene, at: Placed, p: mi.Point3f, chosen: Chosen, found: Found
@@ -350,7 +363,7 @@ class FilmBoundary:
             reach = dr.select(chosen.is_horizon, outlines.horizons.window(chosen.face)[0], reach)
             imprecise |= chosen.is_horizon & outlines.horizons.is_of_grid(chosen.face)
         if outlines.curves is not None:
-            farther = dr.select(chosen.is_curve, found.curve.slack, farther)
+            farther = dr.select(chosen.is_curve, self._blur(at, chosen, found), farther)
         ulps = dr.select(imprecise, 8, 2) * ulp
         largest = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(projection.eye())))
         per_unit = projection.pixels_per_unit(projection.film(p))

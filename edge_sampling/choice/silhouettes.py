@@ -275,10 +275,12 @@ class Silhouettes:
     ) -> mi.Float:
         """How far beside a point p that was sampled to look from x: scene units."""
         aside = beside_edge(p, x)
-        if self.curves is not None and self.curves.tubes is not None:
+        if self.curves is not None:
             piece = dr.select(sample.edge < self.count, 0, sample.edge - self.count)
-            slack = self.curves.point(placement.frames, piece, sample.t, x).slack
-            aside += dr.select(sample.edge < self.count, 0, slack)
+            farther = self.curves.blur(placement.frames, piece, x)
+            if self.curves.tubes is not None:
+                farther += self.curves.point(placement.frames, piece, sample.t, x).slack
+            aside += dr.select(sample.edge < self.count, 0, farther)
         if self.tree is None:
             return aside
         active = sample.edge < self.count

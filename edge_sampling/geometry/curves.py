@@ -60,8 +60,13 @@ SEAMS = {
     "Cylinder": CurveKind.SEAM_OF_CYLINDER,
 }
 
-#: Numbers that tell the frame of a shape, and its inverse.
-NUMBERS = 24
+#: Numbers that tell the frame of a shape, and its inverse; and the first of the latter.
+NUMBERS, INVERSE = 24, 12
+
+#: Mitsuba finds where a ray meets a cylinder from a difference of squares, in single precision. Its error is at most so
+#: many units in the last place of the square of the distance at which the ray starts, in radii; and no curve is looked
+#: for farther than this part of the radius beside where it is.
+UNITS, FARTHEST = 2, 0.25
 
 #: Every curve is cut into so many pieces of equal parameter.
 PIECES = 16
@@ -186,7 +191,7 @@ class Curves:
         """The point v in [0, 1) of a curve that is of no tube."""
         kind = dr.gather(mi.UInt32, self._kind, curve)
         with dr.suspend_grad():
-            x, y, z, o = self._columns(frames, curve, 12)
+            x, y, z, o = self._columns(frames, curve, INVERSE)
             e = mi.Vector3f(dr.detach(eye))
             e = x * e.x + y * e.y + z * e.z + dr.select(far, mi.Vector3f(0), o)
 
@@ -234,7 +239,7 @@ class Curves:
         """Do rims coincide at points p? Where these are as the second shape moves, and the direction towards that."""
         kind = dr.gather(mi.UInt32, self._other_kind, curve)
         with dr.suspend_grad():
-            x, y, z, o = self._columns(frames, curve, 12, self._other_shape)
+            x, y, z, o = self._columns(frames, curve, INVERSE, self._other_shape)
             local = x * p.x + y * p.y + z * p.z + o
         x, y, z, o = self._columns(frames, curve, 0, self._other_shape)
         q = mi.Point3f(x * local.x + y * local.y + z * local.z + o)
@@ -253,11 +258,27 @@ class Curves:
             return mi.Bool(False)
         curve = piece // PIECES
         kind = dr.gather(mi.UInt32, self._kind, curve)
-        x, y, z, o = self._columns(frames, curve, 12)
+        x, y, z, o = self._columns(frames, curve, INVERSE)
         to_local = lambda v: x * v.x + y * v.y + z * v.z
         d, p = to_local(ray.d), to_local(ray.o) + o
         rim = (kind == int(CurveKind.BOTTOM)) | (kind == int(CurveKind.TOP))
         return rim & (dr.square(p.x * d.y - p.y * d.x) > dr.square(d.x) + dr.square(d.y))
+
+    def blur(self, frames: mi.Float, piece: mi.UInt32, start: mi.Point3f) -> mi.Float:
+        """How far beside the curves of a cylinder rays that start at a point may find them: scene units. Detached."""
+        if not self.shapes:
+            return mi.Float(0)
+        curve = piece // PIECES
+        curve = curve if self.tubes is None else self._numbers(curve)[2]
+        kind = dr.gather(mi.UInt32, self._kind, curve)
+        frames, start = dr.detach(frames), dr.detach(start)
+        x, y, z, o = self._columns(frames, curve, INVERSE)
+        local = x * start.x + y * start.y + z * start.z + o
+        r2 = dr.square(local.x) + dr.square(local.y)
+        x, y, *_ = self._columns(frames, curve, 0)
+        radius = dr.sqrt(dr.maximum(dr.squared_norm(x), dr.squared_norm(y)))
+        of_cylinder = (kind >= int(CurveKind.BOTTOM)) & (kind <= int(CurveKind.RIGHT))
+        return dr.select(of_cylinder, radius * dr.minimum(UNITS * dr.epsilon(mi.Float) * r2, FARTHEST), 0)
 
     def _columns(
         self, frames: mi.Float, curve: mi.UInt32, start: int, shapes: mi.UInt32 | None = None
@@ -267,8 +288,8 @@ class Curves:
 
     @staticmethod
     def columns(frames: mi.Float, shape: mi.UInt32, start: int = 0) -> list[mi.Vector3f]:
-        """Images of the axes, and of the origin, of the shapes with these numbers; by `to_world`, or, from 12 on, by
-        its inverse."""
+        """Images of the axes, and of the origin, of the shapes with these numbers; by `to_world`, or, from `INVERSE`
+        on, by its inverse."""
         first = shape * NUMBERS + start
         return [mi.Vector3f(*(dr.gather(mi.Float, frames, first + 4 * i + j) for i in range(3))) for j in range(4)]
 
