@@ -302,10 +302,10 @@ class FilmBoundary:
             if outlines.curves.any_joined:
                 # Between rims that coincide, rounding may let a ray through.
                 joined = chosen.is_curve & outlines.curves.joined(chosen.piece)
-                faces = across(c.inwards), across(c.other)
+                faces, blur = (across(c.inwards), across(c.other)), self._blur(at, chosen, found)
                 for sign, ray, pi in zip((-1, 1), rays, met, strict=True):
                     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, joined)
-                    there = si.is_valid() & (dr.abs_dot(si.n, si.p - p) <= rounding(p, ray.o))
+                    there = si.is_valid() & (dr.abs_dot(si.n, si.p - p) <= rounding(p, ray.o) + blur)
                     jumps &= ~joined | there | ((sign * faces[0] < 0) & (sign * faces[1] < 0))
         return jumps
 

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from .curve_point import CurvePoint
+from .cylinder_rounding import blur
 from .tubes import Tubes
 
 if TYPE_CHECKING:
@@ -62,11 +63,6 @@ SEAMS = {
 
 #: Numbers that tell the frame of a shape, and its inverse; and the first of the latter.
 NUMBERS, INVERSE = 24, 12
-
-#: Mitsuba finds where a ray meets a cylinder from a difference of squares, in single precision. Its error is at most so
-#: many units in the last place of the square of the distance at which the ray starts, in radii; and no curve is looked
-#: for farther than this part of the radius beside where it is.
-UNITS, FARTHEST = 2, 0.25
 
 #: Every curve is cut into so many pieces of equal parameter.
 PIECES = 16
@@ -274,11 +270,10 @@ class Curves:
         frames, start = dr.detach(frames), dr.detach(start)
         x, y, z, o = self._columns(frames, curve, INVERSE)
         local = x * start.x + y * start.y + z * start.z + o
-        r2 = dr.square(local.x) + dr.square(local.y)
         x, y, *_ = self._columns(frames, curve, 0)
-        radius = dr.sqrt(dr.maximum(dr.squared_norm(x), dr.squared_norm(y)))
+        r2 = dr.maximum(dr.squared_norm(x), dr.squared_norm(y))
         of_cylinder = (kind >= int(CurveKind.BOTTOM)) & (kind <= int(CurveKind.RIGHT))
-        return dr.select(of_cylinder, radius * dr.minimum(UNITS * dr.epsilon(mi.Float) * r2, FARTHEST), 0)
+        return dr.select(of_cylinder, blur(dr.sqrt(r2), r2 * (dr.square(local.x) + dr.square(local.y))), 0)
 
     def _columns(
         self, frames: mi.Float, curve: mi.UInt32, start: int, shapes: mi.UInt32 | None = None

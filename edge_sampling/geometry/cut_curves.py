@@ -293,16 +293,30 @@ class CutCurves:
         surfaces = self._pairs.take(piece).surfaces(dr.detach(positions))
         return [mi.Vector3f(s.distance(mi.Vector3d(p))[1]) for s in surfaces]
 
+    def blur(self, positions: mi.Float, piece: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:
+        """How far beside points p of pieces rays from a viewer may tell both surfaces apart: scene units. Detached.
+
+        Along the ray, a cylinder is met with an error of its blur over the cosine to its normal n. Beside the piece,
+        the distances of both surfaces, with the normals n and m, differ by |(n × m) × d| / |n·d m·d| of how far beside
+        it the ray is, in the direction d.
+        """
+        q, d = mi.Vector3d(p), mi.Vector3d(to_viewer)
+        surfaces = self._pairs.take(piece).surfaces(dr.detach(positions))
+        normals, ω = [s.distance(q)[1] for s in surfaces], dr.normalize(d)
+        apart = dr.maximum(dr.norm(dr.cross(dr.cross(*normals), ω)), STEEP)
+        blurred = [s.blur(q + d) * dr.abs_dot(m, ω) for s, m in zip(surfaces, normals[::-1], strict=True)]
+        return mi.Float((blurred[0] + blurred[1]) / apart)
+
     def is_met(
-        self, positions: mi.Float, piece: mi.UInt32, p: mi.Point3f, d: mi.Vector3f, q: mi.Point3f, slack: mi.Float
+        self, positions: mi.Float, piece: mi.UInt32, p: mi.Point3f, ray: mi.Ray3f, q: mi.Point3f, slack: mi.Float
     ) -> mi.Bool:
-        """Does a ray that passes close by a point p of a piece, in the direction d, meet one of both surfaces there, at
-        its point q, and not the other side of a sphere, behind which the curve is? slack : for rounding."""
-        met, direction = mi.Bool(False), mi.Vector3d(d)
+        """Does a ray that passes close by a point p of a piece meet one of both surfaces there, at its point q, and not
+        the other side of a sphere, behind which the curve is? slack : for rounding."""
+        met, start, direction = mi.Bool(False), mi.Vector3d(ray.o), mi.Vector3d(ray.d)
         for s in self._pairs.take(piece).surfaces(dr.detach(positions)):
             off, n = s.distance(mi.Vector3d(q))
             facing = dr.dot(n, direction) * dr.dot(s.distance(mi.Vector3d(p))[1], direction) > 0
-            met |= facing & (dr.abs(off) <= mi.Float64(slack))
+            met |= facing & (dr.abs(off) <= mi.Float64(slack) + s.blur(start))
         return met
 
     # ---------------------- As edges ----------------------

@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .cylinder_rounding import blur
+
 #: Pieces of a whole turn. Of a sphere, half as many from pole to pole.
 TURN = 64
 
@@ -57,6 +59,12 @@ class Surface:
         flat = self.is_a(Kind.PLANE) | self.is_a(Kind.DISK)
         normal, radius, length = dr.normalize(dr.cross(self.x, self.y)), dr.norm(self.x), dr.norm(d)
         return dr.select(flat, dr.dot(normal, d), length - radius), dr.select(flat, normal, d / length)
+
+    def blur(self, start: mi.Vector3d) -> mi.Float64:
+        """How far beside it rays from a point may find a cylinder: scene units. 0 for other surfaces."""
+        off = dr.cross(start - self.o, dr.normalize(self.z))
+        radius = dr.sqrt(dr.maximum(dr.squared_norm(self.x), dr.squared_norm(self.y)))
+        return dr.select(self.is_a(Kind.CYLINDER), blur(radius, dr.squared_norm(off)), 0)
 
     def local(self, p: mi.Vector3d) -> mi.Vector3d:
         """Points in the frame."""

@@ -210,7 +210,7 @@ class DeviceEdges:
             there = dr.abs_dot(si.n, p - si.p) <= slack
             if self.curves is not None:
                 curved, piece = self._piece(edge)
-                there = dr.select(curved, self.curves.is_met(positions, piece, p, ray.d, si.p, slack), there)
+                there = dr.select(curved, self.curves.is_met(positions, piece, p, ray, si.p, slack), there)
             missed |= ~(si.is_valid() & there) & ~self._lets_through(si)
         return missed
 
@@ -291,6 +291,9 @@ class DeviceEdges:
         margin, most = BESIDE_LINE
         corner = dr.select(of(self._few_faces), dr.select(inside & (sharp > 0), dr.minimum(sharp, most), 0), most)
         farther += dr.select(of(self._is_line), 0, margin * corner * lift(scene, p))
+        if self.curves is not None:
+            curved, piece = self._piece(edge)
+            farther += dr.select(curved, self.curves.blur(positions, piece, p, to_viewer), 0)
         return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
 
     def _overhang(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:
