@@ -36,6 +36,9 @@ from .veils import behind_veils, is_veil
 #: How often the distance is halved in which the outline of a grid is known to be.
 HALVINGS = 6
 
+#: What perfect mirrors do, and all that lets light through.
+STRAIGHT = int(mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)
+
 
 @dataclass(frozen=True)
 class BoundarySamples:
@@ -333,7 +336,9 @@ class FilmBoundary:
                 pi.compute_surface_interaction(r, mi.RayFlags.Minimal, contour) for r, pi in zip(rays, met, strict=True)
             ]
             facing = [-dr.sign(dr.dot(hit.n, ray.d)) for hit, ray in zip(si, rays, strict=True)]
-            sides = [dr.select(contour, f, s) for f, s in zip(facing, sides, strict=True)]
+            # What mirrors reflect with that normal, and glass lets through, would start inside of the shape.
+            turns = [contour & ((hit.bsdf().flags() & STRAIGHT) == 0) for hit in si]
+            sides = [dr.select(contour, dr.select(t, f, 0), s) for t, f, s in zip(turns, facing, sides, strict=True)]
             reach, on_curve = dr.select(contour, 2 * self._blur(at, chosen, found), reach), on_curve | contour
         return [Horizon(s, p, on_curve, reach) for s in sides]
 

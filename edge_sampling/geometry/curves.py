@@ -264,15 +264,16 @@ class Curves:
         """How far beside the curves of a cylinder rays that start at a point may find them: scene units. Detached."""
         if not self.shapes:
             return mi.Float(0)
-        curve = piece // PIECES
-        curve = curve if self.tubes is None else self._numbers(curve)[2]
+        on_tube, curve = mi.Bool(False), piece // PIECES
+        if self.tubes is not None:
+            on_tube, _, curve = self._numbers(curve)
         kind = dr.gather(mi.UInt32, self._kind, curve)
         frames, start = dr.detach(frames), dr.detach(start)
         x, y, z, o = self._columns(frames, curve, INVERSE)
         local = x * start.x + y * start.y + z * start.z + o
         x, y, *_ = self._columns(frames, curve, 0)
         r2 = dr.maximum(dr.squared_norm(x), dr.squared_norm(y))
-        of_cylinder = (kind >= int(CurveKind.BOTTOM)) & (kind <= int(CurveKind.RIGHT))
+        of_cylinder = ~on_tube & (kind >= int(CurveKind.BOTTOM)) & (kind <= int(CurveKind.RIGHT))
         return dr.select(of_cylinder, blur(dr.sqrt(r2), r2 * (dr.square(local.x) + dr.square(local.y))), 0)
 
     def _columns(
