@@ -40,7 +40,7 @@ def searches(monkeypatch):
         return find_welded_edges(geometry)
 
     # Not by the name of the module: each variant has one of its own.
-    searching = type(direct_edge().search).boundaries.__globals__
+    searching = type(direct_edge().search).prepare.__globals__
     monkeypatch.setitem(searching, "find_welded_edges", search)
     return found
 
