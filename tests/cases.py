@@ -557,11 +557,11 @@ def thin_cylinder() -> mi.Scene:
     return scene(sensor=camera(), thing={**thing, "bsdf": diffuse(0.8)}, lamp=sun(), sky=constant(0.1))
 
 
-def thin_post() -> mi.Scene:
+def thin_post(sensor: Callable[[], dict] = camera) -> mi.Scene:
     """A thin cylinder that stands in the floor."""
     thing = {"type": "cylinder", "p0": [0.2, -0.8, 0], "p1": [0.2, 0.5, 0], "radius": 0.04, "id": "thing"}
     floor = horizontal((0, -0.3, 0), 2, "floor", bsdf=diffuse(0.0), emitter=light(1, 1, 1))
-    return scene(sensor=camera(), thing={**thing, "bsdf": diffuse(0.0)}, floor=floor)
+    return scene(sensor=sensor(), thing={**thing, "bsdf": diffuse(0.0)}, floor=floor)
 
 
 def over_floor(thing: dict, lamps: tuple[Callable[[], dict], ...]) -> mi.Scene:
@@ -902,7 +902,8 @@ CASES = [
     Case("cylinder_sun_turn", cylinder_over(sun), THING_TURN, 6e-3),
     Case("cylinder_soft", cylinder_over(ceiling_light), THING_SIDE, 1e-2, runs=24),
     Case("cylinder_camera", cylinder_over(ceiling_light), CAMERA_X, 6e-3, runs=24),
-    Case("thin_post", thin_post, {"key": "floor.vertex_positions", "direction": [0, 1, 0]}, 6e-3),
+    Case("thin_post", thin_post, FLOOR_UP, 6e-3),
+    Case("thin_post_orthographic", lambda: thin_post(orthographic), FLOOR_UP, 6e-3),
     Case("thin_cylinder", thin_cylinder, THING_SIDE, 6e-3, runs=24, spp=256),
     Case("sphere_light", sphere_light, LAMP_SIDE, 2e-2, spp=128, runs=24),
     # What random scenes found, in its simplest form.

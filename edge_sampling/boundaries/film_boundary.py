@@ -358,7 +358,9 @@ class FilmBoundary:
         imprecise, farther, reach = chosen.is_curve | chosen.is_cut, mi.Float(0), mi.Float(0)
         if outlines.edges is not None:
             viewer, grids = projection.viewer(at.aperture_sample), outlines.edges.grids
-            to_viewer = mi.Vector3f(viewer) if projection.orthographic else viewer - p
+            to_viewer = viewer - p
+            if projection.orthographic:
+                to_viewer = mi.Vector3f(viewer) * dr.dot(projection.eye() - p, viewer)
             beside_edge = outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)
             farther = dr.select(chosen.is_edge, beside_edge, 0)
             if grids.any:

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.meshes import faces, has_interpolated_normals, normals_of, vertices
+from rimlight.edge_sampling.geometry.meshes import BENT, faces, has_interpolated_normals, normals_of, vertices
 
 #: How far the cosine between the normals of faces and vertices may be below 1.
 FINE = 0.002
@@ -58,9 +58,11 @@ def fringe(shape: mi.Shape) -> float:
 
 
 def mean_fringe(shape: mi.Shape) -> float:
-    """The same, at most of each face, averaged over the area of the faces."""
+    """The same, at most of each face, averaged over the area of the faces that are bent: flat ground around a coarse
+    hill does not make it finer."""
     off, area = fringes(shape)
-    return float(off @ area / area.sum()) if off.size else 0.0
+    area = np.where(off > BENT**2 / 2, area, 0)
+    return float(off @ area / area.sum()) if area.any() else 0.0
 
 
 def fringes(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:

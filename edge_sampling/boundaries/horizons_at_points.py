@@ -32,8 +32,8 @@ from .fine_mirrors import mean_fringe
 from .horizon import Horizon, HorizonPoint, Horizons
 from .tracer import ShadingPoint, Tracer
 
-#: How far the cosine between the normals of faces and vertices of a mesh may be below 1, on average, without these
-#: jumps.
+#: How far the cosine between the normals of faces and vertices of a mesh may be below 1, on average over its bent
+#: faces, without these jumps.
 COARSE = 0.03
 
 #: Faces of which one is kept, in proportion to what its curve contributes if nothing hides it.

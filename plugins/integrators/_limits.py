@@ -32,6 +32,9 @@ from rimlight.transport.paths import Depths
 
 from ._coarse_limits import FRINGE, coarse_lamps, coarse_meshes
 
+#: How much the radius of tubes may grow per length.
+STEEP = 0.05
+
 #: What perfect mirrors and glass do.
 MIRRORS = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
 
@@ -330,10 +333,6 @@ def of_tubes(scene: mi.Scene, geometry: Geometry, moving: Moving) -> list[str]:
             f"end, almost along them: rays miss them there. Let their radius grow by at most {STEEP:g} per length."
         )
     return limits
-
-
-#: How much the radius of tubes may grow per length.
-STEEP = 0.05
 
 
 def has_its_inverse(shape: Any) -> bool:

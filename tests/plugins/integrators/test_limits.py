@@ -15,6 +15,7 @@ from random_scenes import ball
 
 import rimlight
 from rimlight._plan import listed
+from rimlight.edge_sampling.boundaries.fine_mirrors import mean_fringe
 from rimlight.edge_sampling.geometry import texture_lines
 
 FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
@@ -246,6 +247,16 @@ def test_indirect_light_of_coarse_meshes(quads, max_depth, key, samples):
     plan = mi.load_dict({"type": "prb_edge", "max_depth": max_depth}).plan(scene, spp=1)
     assert bool(plan.term("horizons from points").samples) == samples
     assert not any('"thing"' in limit for limit in plan.limits)
+
+
+def test_flat_ground_around_a_coarse_thing_does_not_make_it_finer():
+    """They are one mesh, of which the thing is a small part."""
+    points, _, _, faces = ball(4)
+    ground = np.array([[-40, -0.3, -40], [-40, -0.3, 40], [40, -0.3, -40], [40, -0.3, 40]])
+    on_ground = np.concatenate([faces, len(points) + np.array([[0, 1, 2], [2, 1, 3]])])
+    alone = cases.mesh("alone", 0.3 * points, faces, normals=True)
+    thing = cases.mesh("thing", np.concatenate([0.3 * points, ground]), on_ground, normals=True)
+    assert mean_fringe(thing) == pytest.approx(mean_fringe(alone), rel=1e-3)
 
 
 @pytest.mark.parametrize("distance", [0, 100, 1e4])
