@@ -4,7 +4,8 @@ A derivative may be taken under the integral over any sample space, as long as t
 it: what the interior term holds fixed is what the sides of a boundary move with. This is the one place that decides it:
 
 ====================================  ======================================================================
-what the camera sees                  the film position: the *ray* is fixed on the film, and moves with the camera
+what the camera sees                  the film position: the *ray* is fixed on the film, and moves with the camera;
+                                      of fine textures, the *material point* (`first_points.py`)
 every further vertex of a path        far from the vertex before: the *material point*, which follows its surface;
                                       close to it, or behind rough glass: the direction, so that the vertex
                                       slides over its surface
@@ -63,18 +64,6 @@ FLUSH = 16
 
 
 # ---------------------- Points ----------------------
-
-
-def seen_by_camera(
-    scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool, *, attached: bool
-) -> mi.SurfaceInteraction3f:
-    """The surface that a camera ray meets. A surface that moves is met by a fixed ray; a ray that moves with the camera
-    takes its hit along. With all its derivatives but where the surface is curved, and seen edge-on."""
-    with dr.resume_grad(when=attached):
-        si = surface_met(scene, ray, pi, mi.RayFlags.All, active)
-        if attached:
-            si = dr.select(grazes(si, ray.d, active), dr.detach(si), si)
-        return si
 
 
 def material_point(
@@ -394,18 +383,20 @@ class Parametrisation:
             if by_light:
                 cos = dr.select(smooth, shading_cos, cos)
         geometry = cos / r2
-        if self.moving:
-            geometry *= self._area(pi, ray, active)
-        for shape in self.grids:
-            geometry *= _area_of_grid(shape, pi, y, active)
+        geometry *= self.area(pi, ray, y, active)
         geometry = _relative(geometry)
         still = active & flush(si, y)
         fixed = still | grazes(y, ω, active) if self.any_curved else still
         y, ω = dr.select(still, dr.detach(y), y), dr.select(still, dr.detach(ω), ω)
         return Connection(y, ω, dr.select(fixed, dr.detach(geometry), geometry), still, smooth & ~still, spread)
 
-    def _area(self, pi, ray, active):
-        """What an area element on the shapes hit is proportional to, attached; 1 where they do not move."""
+    def area(self, pi, ray, y, active) -> mi.Float:
+        """What an area element at y, which `pi` stands for, is proportional to, attached; 1 where nothing moves."""
+        area = mi.Float(1)
+        for shape in self.grids:
+            area *= _area_of_grid(shape, pi, y, active)
+        if not self.moving:
+            return area
         on_mesh, on_other = mi.Bool(False), mi.Bool(False)
         for shape, is_mesh in self.moving:
             met = (pi.shape == shape) | (pi.instance == shape)
@@ -418,7 +409,8 @@ class Parametrisation:
             corner = mi.PreliminaryIntersection3f(pi)
             corner.prim_uv = mi.Point2f(u, v)
             corners.append(material_point(ray, corner, on_mesh).p)
-        area = dr.select(on_mesh, dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0])), 1)
+        of_mesh = dr.norm(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        area = dr.select(on_mesh, of_mesh, area)
         if all(is_mesh for _, is_mesh in self.moving):
             return area
         si = material_point(ray, pi, on_other, mi.RayFlags.dPdUV)

@@ -31,6 +31,7 @@ from building import (
 )
 from coarse import COARSE
 from cuts import CURVES, CUTS
+from fine_textures import FINE
 from grids import GRIDS, LONGER
 from hidden_lights import HIDDEN
 from instances import INSTANCES
@@ -990,6 +991,7 @@ CASES = [
         for k, (*of, depth) in GRIDS.items()
     ),
     *(Case(k, *of, spp=64, runs=16, integrator=upto(depth), reference_spp=1024) for k, (*of, depth) in WIRES.items()),
+    *(Case(k, *of, spp=64, runs=6, integrator=upto(depth), reference_spp=4096) for k, (*of, depth) in FINE.items()),
     *(
         Case(k, *of, spp=256, integrator=bdpt_edge(8), reference_spp=2048, reference_images="bdpt")
         for k, of in HIDDEN.items()

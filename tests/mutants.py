@@ -96,7 +96,7 @@ MUTANTS = [
         "e.density *= 1.02 * dr.select(emission,",
     ),
     # ---------------------- Signs, sides, velocities ----------------------
-    mutant("film boundary: wrong sign", FILM, "jump -= sign * L * weight", "jump += sign * L * weight"),
+    mutant("film boundary: wrong sign", FILM, "jump -= seen[-1]", "jump += seen[-1]"),
     mutant(
         "edges from points: velocity of what is seen left out",
         SHADING,
@@ -112,8 +112,8 @@ MUTANTS = [
     mutant(
         "interior: change of area left out",
         PARAMETRISATION,
-        "if self.moving:\n            geometry",
-        "if False:\n            geometry",
+        "if not self.moving:\n            return area",
+        "if True:\n            return area",
     ),
     mutant(
         "interior: rotation of the environment left out",

@@ -20,11 +20,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.first_points import FirstPoints
 from rimlight.edge_sampling.geometry.device_edges import line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
 from rimlight.edge_sampling.lights import Lights
-from rimlight.edge_sampling.projection.sensors import inside_frame
+from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 
 from .crease import Crease, Directions, LuneOrCrease
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
@@ -70,6 +71,7 @@ class BoundaryPoints:
     horizons : on which side of a horizon of interpolated normals each of the rays is; None where there are none.
     directions : from where light is looked for on both sides, where it is active; None: as everywhere.
     sensor_moves : does the velocity depend on parameters of the sensor?
+    aperture_sample : see `Projection.film`.
     """
 
     position: mi.Point2f
@@ -82,6 +84,7 @@ class BoundaryPoints:
     horizons: list[Horizon | None]
     directions: Directions | None
     sensor_moves: bool
+    aperture_sample: mi.Point2f | None
 
 
 class FilmBoundary:
@@ -142,19 +145,33 @@ class FilmBoundary:
         """
         with dr.suspend_grad():
             points = self.points(tracer, sensor, sampler, count)
-            jump, alpha_jump = mi.Spectrum(0), mi.Float(0)
+            jump, alpha_jump, seen = mi.Spectrum(0), mi.Float(0), []
             sides = zip((-1, 1), points.rays, points.met, points.weights, points.horizons, strict=True)
             for sign, ray, pi, weight, horizon in sides:
                 L, alpha = tracer.seen(ray, pi, sampler.clone(), points.active, horizon, points.directions)
-                jump -= sign * L * weight
+                seen.append(sign * L * weight)
+                jump -= seen[-1]
                 alpha_jump -= sign * alpha
             if points.sensor_moves:
                 # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.
                 dr.eval(jump, alpha_jump, points.n_dl)
         with dr.resume_grad():
             normal_velocity = dr.dot(points.n_dl, points.velocity)
+            value = jump * normal_velocity
+            if tracer.held is not None:
+                value += self._with_sides(tracer.held, sensor, points, seen)
             wavelengths = points.rays[1].wavelengths
-            return BoundarySamples(points.position, jump * normal_velocity, alpha_jump * normal_velocity, wavelengths)
+            return BoundarySamples(points.position, value, alpha_jump * normal_velocity, wavelengths)
+
+    @staticmethod
+    def _with_sides(held: FirstPoints, sensor: mi.Sensor, points: BoundaryPoints, seen: list) -> mi.Spectrum:
+        """What the motion of what is held does on both sides. seen : radiance there, with the signs of the sides."""
+        value, projection = mi.Spectrum(0), Projection(sensor)
+        dr.eval(seen, points.rays, points.met, points.n_dl)
+        for ray, pi, L in zip(points.rays, points.met, seen, strict=True):
+            velocity = held.velocity(ray, pi, points.active, projection, points.aperture_sample)
+            value += L * dr.dot(points.n_dl, velocity)
+        return value
 
     def points(self, tracer: Tracer, sensor: mi.Sensor, sampler: mi.Sampler, count: int) -> BoundaryPoints:
         """Points of the film boundary, of which `sample` makes samples."""
@@ -198,8 +215,8 @@ class FilmBoundary:
             shared = self._lune(at, chosen, lights, p, rays, met)
             if tracer.shares_directions:
                 shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
-            sensor_moves = at.projection.attached
-            return BoundaryPoints(beside, n_dl, velocity, rays, met, weights, active, horizons, shared, sensor_moves)
+            sees = met, weights, active, horizons, shared, at.projection.attached, at.aperture_sample
+            return BoundaryPoints(beside, n_dl, velocity, rays, *sees)
 
     def _on_grid(self, tracer: Tracer, at: Placed, sensor, chosen: Chosen, found: Found, u, p, offset, active) -> tuple:
         """Where the outline of a grid is, or a crease between its voxels, which are only known to be somewhere between

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.choice.silhouettes import Silhouettes
 from rimlight.edge_sampling.divided_light import DividedLight
+from rimlight.edge_sampling.first_points import HeldShapes
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_lines import TextureLines
 from rimlight.edge_sampling.parametrisation import Slides
@@ -31,7 +32,8 @@ class Boundaries:
     shadows that mirrors or glass may show. `surfaces` : what chains meet, where there are mirrors or textures.
     `lights` : chooses one, where there are many. `lamps` : how their light is divided.
     `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from surfaces.
-    `horizons` : where interpolated normals turn away from points."""
+    `horizons` : where interpolated normals turn away from points. `held` : shapes whose points are held where the
+    camera sees them."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -52,6 +54,7 @@ class Boundaries:
     deep: DeepShadows | None = None
     lamps: DividedLight | None = None
     horizons: HorizonsAtPoints | None = None
+    held: HeldShapes | None = None
 
     @property
     def silhouettes(self) -> Silhouettes | None:

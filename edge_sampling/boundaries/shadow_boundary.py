@@ -150,12 +150,16 @@ class ShadowBoundary:
 
         with dr.resume_grad():
             m = material_point(view.ray, view.seen, active).p
-            held = m
+            held, stands = m, tracer.held and tracer.held.are(view.ray, view.seen, active)
             if view.slid is not None:
                 held = still_on_film(projection, m, shadow.facing, view.aperture_sample, active)
+                held = held if stands is None else dr.select(stands, m, held)
             x = self._moving(tracer.scene, placement, light, edge, shadow, view, m, held, met)
             moved = projection.film(x, view.aperture_sample).position()
-            value = jump * dr.dot(n_dl, dr.select(active, moved - dr.detach(moved), 0))
+            velocity = dr.select(active, moved - dr.detach(moved), 0)
+            if tracer.held is not None:
+                velocity -= tracer.held.velocity(view.ray, view.seen, active, projection, view.aperture_sample)
+            value = jump * dr.dot(n_dl, velocity)
             return ShadowSamples(u, value, view.ray.wavelengths, light.light)
 
     def _moving(

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
+from rimlight.edge_sampling.first_points import FirstPoints
 from rimlight.edge_sampling.parametrisation import Turning, Vicinity
 
 from .crease import Directions
@@ -46,12 +47,14 @@ class Tracer(Protocol):
     scene : mi.Scene
     lights : chooses one of many lights; None: all are equally likely.
     lamps : how their light is divided; None: it is held at points of the lamps.
+    held : what is held where the sensor sees it; None: nothing.
     shares_directions : may it be told in which directions to look for the light that a crease reflects?
     """
 
     scene: mi.Scene
     lights: LightChoice | None
     lamps: DividedLight | None
+    held: FirstPoints | None
     shares_directions: bool
 
     def scatters(self, depth: mi.UInt32 | int) -> mi.Bool | bool:

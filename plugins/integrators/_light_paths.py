@@ -16,8 +16,9 @@ import mitsuba as mi
 
 from rimlight.edge_sampling import Horizon, Lights
 from rimlight.edge_sampling.boundaries.horizon import turn_to_side
+from rimlight.edge_sampling.first_points import seen_by_camera
 from rimlight.edge_sampling.geometry.instances import surface_met
-from rimlight.edge_sampling.parametrisation import FOLLOWS, look_from, seen_by_camera
+from rimlight.edge_sampling.parametrisation import FOLLOWS, look_from
 from rimlight.transport.paths import Vertex, step
 from rimlight.transport.scattering import Numbers, Scattering
 from rimlight.transport.tracer import PathTracer

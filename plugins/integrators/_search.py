@@ -39,11 +39,13 @@ from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
+from rimlight.edge_sampling.fine_textures import fine_textures
+from rimlight.edge_sampling.first_points import HeldShapes, can_hold
 from rimlight.edge_sampling.geometry.grids import Grids
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.interpolated import normals_turn, texture_slides
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
-from rimlight.edge_sampling.geometry.meshes import inner, surfaces
+from rimlight.edge_sampling.geometry.meshes import inner, lets_rays_through, surfaces
 from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_edges import TextureEdges
@@ -73,13 +75,16 @@ class BoundarySearch:
     planes : does its derivative have what the planes of faces do to soft light, where other normals shade?
     from_points : does it have boundaries as shading points see them?
     from_surfaces : and as vertices of light subpaths see them?
+    holds : may points of fine textures be held, as the first of its sensors sees them?
     """
 
     #: Nothing, for `dr.freeze`: what a frozen function depends on is what `find_boundaries` returns to it.
     DRJIT_STRUCT = dict.fromkeys(())
 
-    def __init__(self, who: str, depths: Depths, *, planes: bool, from_points: bool, from_surfaces: bool):
-        self.who, self.depths, self.planes = who, depths, planes
+    def __init__(
+        self, who: str, depths: Depths, *, planes: bool, from_points: bool, from_surfaces: bool, holds: bool = False
+    ):
+        self.who, self.depths, self.planes, self.holds = who, depths, planes, holds
         self.from_points, self.from_surfaces = from_points, from_surfaces
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
@@ -129,7 +134,7 @@ class BoundarySearch:
         key = (*moving.key, sppi > 0, self.depths)
         if key not in self._boundaries:
             self._refuse_while_recording()
-            self._boundaries[key] = self._find(scene, moving, sppi)
+            self._boundaries[key] = self._find(scene, sensor, moving, sppi)
         boundaries = self._boundaries[key]
         if boundaries.shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
             boundaries.shading.boxes.find_shapes()
@@ -250,10 +255,11 @@ class BoundarySearch:
                 "them a thickness."
             )
 
-    def _find(self, scene: mi.Scene, moving: Moving, sppi: int) -> Boundaries:
+    def _find(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving, sppi: int) -> Boundaries:
         self._refuse_instances(moving)
-        lights = Lights(scene)
-        on_film = np.array([m or moving.camera for m in moving.flags], bool)
+        lights, held = Lights(scene), self._held(scene, sensor, moving)
+        # What is held and moves behind edges that stand still comes out from behind them.
+        on_film = np.array([m or moving.camera or held is not None for m in moving.flags], bool)
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
         soft = self.planes and self.depths.scatters(1) and (self.depths.scatters(2) or sized)
         edges = self._edges_of(self.geometry)
@@ -277,8 +283,17 @@ class BoundarySearch:
         slides = Slides.BEHIND_GLASS if glass else Slides.NOTHING
         what = moving.flags, moving.camera, moving.lights
         chains = self._chains(scene, moving, sppi)
-        others = LightChoice.of(scene), deep, lamps, horizons
+        others = LightChoice.of(scene), deep, lamps, horizons, held
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, *others)
+
+    def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
+        """The shapes whose points are held where the camera sees them, since they have fine textures."""
+        if not self.holds or not can_hold(sensor) or self.geometry.others:
+            return None
+        shapes = surfaces(scene) if moving.camera else list(dict.fromkeys(inner(s) for s in moving.shapes))
+        straight = lambda s: s.bsdf() is None or is_mirror(s) or lets_rays_through(s)
+        fine = fine_textures(scene, sensor, [s for s in shapes if not straight(s)])
+        return HeldShapes(scene, fine) if fine else None
 
     def _chains(
         self, scene: mi.Scene, moving: Moving, sppi: int

@@ -16,6 +16,7 @@ from rimlight._collection import no_collection
 from rimlight._plan import Plan, names
 from rimlight.edge_sampling import Batch
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.first_points import FirstPoints, can_hold
 from rimlight.edge_sampling.geometry.instances import copied_places
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.order import TERMS
@@ -95,6 +96,8 @@ class EdgeIntegrator(ADIntegrator):
             raise InputError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         options = {"planes": self.PLANES, "from_points": self.FROM_POINTS, "from_surfaces": self.FROM_SURFACES}
+        # Tracers of others need not know of it.
+        options["holds"] = self.TRACER is PathTracer
         self.search = BoundarySearch(self.name, self.depths, **options)
         #: By what the samples of a term are multiplied, by its name; empty: all have as many. See `balance`.
         self.shares: dict[str, float] = {}
@@ -217,6 +220,8 @@ class EdgeIntegrator(ADIntegrator):
             film.put_block(weights)
         for term, value in zip(terms, values, strict=True):
             block = film.create_block()
+            if term.one_pixel:
+                block = mi.ImageBlock(film.crop_size(), film.crop_offset(), block.channel_count())
             # Mitsuba may add up neighbours in a wavefront first, if those belong to one pixel.
             block.set_coalesce(block.coalesce() and term.per_pixel >= 4)
             weight = term.weight if weights is None else 0.0
@@ -289,6 +294,9 @@ class EdgeIntegrator(ADIntegrator):
         tracer = self.TRACER(scene, self)
         tracer.slides, tracer.lights, tracer.lamps = boundaries.slides, boundaries.lights, boundaries.lamps
         tracer.fine_mirrors = boundaries.fine_mirrors
+        # Without the film boundary, or the interior, the other one is to be what it is by itself.
+        if boundaries.held is not None and can_hold(sensor) and counts.interior and counts.film:
+            tracer.held = FirstPoints(boundaries.held, sensor)
         return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.TERMS, self.shares)
 
     def passes(self, job: Job) -> list[Job]:

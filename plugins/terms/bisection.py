@@ -21,7 +21,7 @@ from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
 from rimlight.edge_sampling.geometry.device_edges import BEHIND, overhang, rounding
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
-from rimlight.edge_sampling.parametrisation import Vicinity
+from rimlight.edge_sampling.parametrisation import FOLLOWS, Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
 from rimlight.edge_sampling.rays import lift
 from rimlight.transport.cut import Cut
@@ -119,7 +119,7 @@ class BisectionTerm(Term):
             again = chains.part((chains.first(wide.start, lost), chains.first(wide.end, lost)), wide, lost, None)
             return dr.select(lost, again, at), None
         log, at = written(job.tracer.scene, first[0].ray, 1, job.tracer.depths, follow, lambda at: at.a.depth)
-        chain = Chain(job.tracer.scene, Vicinity.of(first[0].pi))
+        chain = Chain(job.tracer.scene, Vicinity.of(first[0].pi), held=job.tracer.held)
         behind = at.found & (at.a.depth > 1)
         last = log.vertex(dr.maximum(at.a.depth, 2) - 1, behind)
         one = dr.full(mi.UInt32, 1, dr.width(active))
@@ -192,6 +192,11 @@ class BisectionTerm(Term):
             if line is not None:
                 on_line = usable & at.on_texture
                 si = surface_met(job.tracer.scene, ray, at.a.pi, mi.RayFlags.All, on_line)
+                if job.tracer.held is not None:
+                    # What is held there moves with the line, but for the motion of this over the surface.
+                    first = on_line & (at.a.depth == 1)
+                    first = job.tracer.held.are(at.a.ray, at.a.pi, first)
+                    si = dr.select(first, surface_met(job.tracer.scene, at.a.ray, at.a.pi, FOLLOWS, first), si)
                 g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, si), 0), g)
             if border is not None:
                 there = usable & border.found & at.on_cast_shadow

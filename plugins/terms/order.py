@@ -8,6 +8,7 @@ from .film import FilmTerm
 from .horizons import HorizonsTerm
 from .indirect import IndirectShadowsTerm
 from .interior import InteriorTerm
+from .passing import PassingTerm
 from .points import PointsTerm
 from .shadows import ShadowsTerm
 from .term import Term
@@ -15,6 +16,7 @@ from .term import Term
 #: In this order: path replay, in the first, needs that nothing else is attached to the parameters.
 TERMS: tuple[Term, ...] = (
     InteriorTerm(),
+    PassingTerm(),
     FilmTerm(),
     BisectionTerm(),
     ShadowsTerm(),

@@ -52,6 +52,7 @@ class FilmSamples:
     replay : None, or what differentiates the part of the path that `value` is not attached to.
     throughput : of the camera ray, which weighs that part.
     cuts : where `value` is cut from what it depends on: they hand gradients on in backward mode, one after the other.
+    one_pixel : do they count for the pixel alone in which they are, and not by its filter?
     """
 
     position: mi.Point2f
@@ -62,6 +63,7 @@ class FilmSamples:
     replay: Replay | None = None
     throughput: mi.Spectrum | None = None
     cuts: tuple[MovingVertex | Cut, ...] = ()
+    one_pixel: bool = False
 
     def detached(self) -> FilmSamples:
         return replace(self, value=dr.detach(self.value))

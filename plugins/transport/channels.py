@@ -8,7 +8,7 @@ from difflib import get_close_matches
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.parametrisation import seen_by_camera
+from rimlight.edge_sampling.first_points import seen_by_camera
 from rimlight.edge_sampling.refusals import InputError
 
 from .tracer import PathTracer

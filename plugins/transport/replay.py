@@ -17,7 +17,8 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight, axis_of
-from rimlight.edge_sampling.parametrisation import Vicinity, look_from, seen_by_camera, sliding_point
+from rimlight.edge_sampling.first_points import FirstPoints, seen_by_camera
+from rimlight.edge_sampling.parametrisation import Vicinity, look_from, sliding_point
 from rimlight.edge_sampling.refusals import Refusal
 
 from .log import Log
@@ -45,6 +46,7 @@ class Chain:
 
     vicinity : in which they slide.
     lights, lamps : see `Scattering`.
+    held : what is held where the camera sees it.
     """
 
     def __init__(
@@ -53,9 +55,10 @@ class Chain:
         vicinity: Vicinity,
         lights: LightChoice | None = None,
         lamps: DividedLight | None = None,
+        held: FirstPoints | None = None,
     ):
         self.scattering = Scattering(scene, attached=True, lights=lights, lamps=lamps)
-        self.vicinity = vicinity
+        self.vicinity, self.held = vicinity, held
 
     def surface(self, vertex: Vertex, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """The surface at a vertex, attached to the point and the direction from which its ray comes, too."""
@@ -274,7 +277,8 @@ class MovingVertex:
 
     def _start(self, ray: mi.Ray3f) -> None:
         """The first vertex, and what moves the second."""
-        si = self.at_first = seen_by_camera(self.chain.scattering.scene, ray, self.first.pi, self.active, attached=True)
+        scene, pi = self.chain.scattering.scene, self.first.pi
+        si = self.at_first = seen_by_camera(scene, ray, pi, self.active, attached=True, held=self.chain.held)
         active = self.active & (self._last > 1)
         second = self.log.vertex(dr.full(mi.UInt32, 2, dr.width(self.depth)), active)
         d = second.ray.d

@@ -14,7 +14,8 @@ from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, tur
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
-from rimlight.edge_sampling.parametrisation import Slides, Vicinity, seen_by_camera
+from rimlight.edge_sampling.first_points import FirstPoints, seen_by_camera
+from rimlight.edge_sampling.parametrisation import Slides, Vicinity
 from rimlight.edge_sampling.rays import spawn_ray
 
 from .paths import Depths, Vertex, scattered_light
@@ -51,6 +52,9 @@ class PathTracer:
     lights: LightChoice | None = None
     lamps: DividedLight | None = None
 
+    #: What is held where the camera sees it; None: nothing.
+    held: FirstPoints | None = None
+
     #: See `rimlight.edge_sampling.boundaries.tracer.Tracer`.
     shares_directions = True
 
@@ -78,10 +82,11 @@ class PathTracer:
         horizon: Horizon | None = None,
         directions: Directions | None = None,
         pi: mi.PreliminaryIntersection3f | None = None,
+        stretch: mi.Float | float = 1.0,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
 
-        pi : their first hits, if these are known.
+        pi : their first hits, if these are known. stretch : see `FirstPoints.stretch`.
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
         directions : see `Scattering.scatter`, for the first hit.
         """
@@ -92,14 +97,14 @@ class PathTracer:
         # ---------------------- First hit ----------------------
 
         pi = self.first_hit(ray, active) if pi is None else pi
-        si = seen_by_camera(scene, ray, pi, active, attached=attached)
+        si = seen_by_camera(scene, ray, pi, active, attached=attached, held=self.held)
         if horizon is not None:
             turn_to_side(si, ray, horizon)
         if self.fine_mirrors is not None and not attached:
             self.fine_mirrors.turn(si, ray, active)
         with dr.resume_grad(when=attached):
             if not self.hide_emitters:
-                L += si.emitter(scene).eval(si, active)
+                L += si.emitter(scene).eval(si, active) * stretch
         bsdf = si.bsdf(ray)
         backdrop = active & (scene.environment() is not None and not self.hide_emitters)
         active &= si.is_valid()
@@ -114,7 +119,7 @@ class PathTracer:
             si, bsdf, scattering.draw(sampler, active), active, vicinity, directions=directions
         )
         with dr.resume_grad(when=attached):
-            L += direct
+            L += direct * stretch
         valid = backdrop | (active & ~onwards.through)
         if not self.scatters(2):
             return Radiance(L, valid | scattering.stops(onwards.ray, onwards.pi, sampler, active & onwards.through))
@@ -124,7 +129,7 @@ class PathTracer:
         second = Vertex(detached, onwards.pi, two, β, η, onwards.mirrored, onwards.slides)
         if attached:
             with dr.resume_grad():
-                start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight))
+                start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight * stretch))
             chosen = self.lights, self.lamps
             return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, *chosen))
         indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, lights=self.lights)
@@ -175,7 +180,7 @@ class PathTracer:
         first = camera_vertex(ray, self.first_hit(ray, True))
         if not self.scatters(2):
             return first
-        return Walk(self.scene, sampler, first, self.depths, self.slides, beyond)
+        return Walk(self.scene, sampler, first, self.depths, self.slides, beyond, self.held)
 
     def point(
         self, ray: mi.Ray3f, walk: Walk | Vertex, mode: dr.ADMode, *, beyond: int = 0
@@ -189,7 +194,8 @@ class PathTracer:
         lamps = self.lamps if beyond == 0 else None
         if not isinstance(walk, Walk):
             pi = walk.pi
-            si, no = seen_by_camera(self.scene, ray, pi, pi.is_valid(), attached=True), mi.Bool(False)
+            si = seen_by_camera(self.scene, ray, pi, pi.is_valid(), attached=True, held=self.held)
+            no = mi.Bool(False)
             still, turning = Vicinity(mi.Float(0)), None
             if lamps is not None:
                 with dr.resume_grad():

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.divided_light import DividedLight
+from rimlight.edge_sampling.first_points import FirstPoints
 from rimlight.edge_sampling.parametrisation import Slides, Vicinity
 
 from .log import Log
@@ -23,6 +24,7 @@ class Walk:
     first : the vertices that camera rays meet.
     slides : see `Vicinity`.
     beyond : one vertex is chosen for each of these numbers; at least so many more may follow it.
+    held : what is held where the camera sees it.
     """
 
     def __init__(
@@ -33,11 +35,12 @@ class Walk:
         depths: Depths,
         slides: Slides,
         beyond: Sequence[int],
+        held: FirstPoints | None = None,
     ):
         # What is met first is used in the kernels of all, which are not to trace it again.
         dr.eval(first.ray, first.pi)
         self.beyond, self.first, vicinity = beyond, first, Vicinity.of(first.pi, slides)
-        self._chain = chain = Chain(scene, vicinity)
+        self._chain = chain = Chain(scene, vicinity, held=held)
 
         def follow(log: Log | None) -> list[Choice]:
             def note(vertex, numbers, onwards, active):

@@ -21,7 +21,8 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.divided_light import DividedLight
-from rimlight.edge_sampling.parametrisation import Slides, Vicinity, seen_by_camera, shown_by_mirror
+from rimlight.edge_sampling.first_points import seen_by_camera
+from rimlight.edge_sampling.parametrisation import Slides, Vicinity, shown_by_mirror
 from rimlight.edge_sampling.rays import lift, spawn_ray
 
 from .emission import Around

@@ -223,6 +223,8 @@ ROOMS = (
     "rimlight.edge_sampling.lights",
     "rimlight.edge_sampling.smooth_lamps",
     "rimlight.edge_sampling.parametrisation",
+    "rimlight.edge_sampling.first_points",
+    "rimlight.edge_sampling.fine_textures",
     "rimlight.edge_sampling.emitter_table",
     "rimlight.edge_sampling.close_lamps",
     "rimlight.edge_sampling.divided_light",

@@ -6,6 +6,7 @@ import beams
 import cases
 import coarse
 import drjit as dr
+import fine_textures
 import mitsuba as mi
 import numpy as np
 import polished
@@ -49,6 +50,8 @@ VALUES = [
     ("polished", "floor.vertex_positions"),
     ("wires", "wires.control_points"),
     ("wires", "sensor.to_world"),
+    ("fine", "sensor.to_world"),
+    ("fine", "back.vertex_positions"),
 ]
 SCENES = {
     "two_triangles": cases.two_triangles,
@@ -63,6 +66,7 @@ SCENES = {
     "bulb": touching_lamps.bulb,
     "polished": polished.floor,
     "wires": wires.before_wall(wires.sun),
+    "fine": fine_textures.stage(back=fine_textures.fine, film=fine_textures.gaussian),
     "fisheye": cases.room(cases.fisheye),
     "batch": cases.room(cases.batch),
 }

@@ -1,0 +1,66 @@
+"""Which shapes have textures so fine that their points are better held on them: see `first_points.py`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .geometry.meshes import inner, objects_below
+
+#: Rays by which textures are looked at.
+RAYS = 2**14
+
+#: Distance on the film of two positions close to each other, pixels.
+STEP = 2**-6
+
+#: How much faster the light of a fine texture changes there than over a pixel.
+RATIO = 4.0
+
+
+def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list[Any]:
+    """Those among some shapes of which what they reflect, and emit, changes fast between two positions on the film that
+    are close to each other, relative to what it changes over a pixel. Looks at some thousand rays."""
+    varying = [s for s in shapes if _varies(s)]
+    if not varying:
+        return []
+    with dr.suspend_grad():
+        near, far, of = (np.array(x) for x in _changes(scene, sensor))
+    found = []
+    for shape in varying:
+        own = of == int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(inner(shape)))[0])
+        slope, change = (np.square(x[own], dtype=np.float64).sum() for x in (near, far))
+        if slope > RATIO**2 * change:
+            found.append(shape)
+    return found
+
+
+def _varies(shape: Any) -> bool:
+    below = objects_below(inner(shape)).values()
+    return any(isinstance(o, mi.Texture) and o.is_spatially_varying() for o in below)
+
+
+def _changes(scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.Float, mi.Float, mi.UInt32]:
+    """At many positions on the film, how much what is seen changes per pixel, over a short step, and over a whole
+    pixel of its texture; and the number of the shape."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, RAYS)
+    time, wavelength, turn = sensor.shutter_open(), sampler.next_1d(), sampler.next_1d() < 0.5
+    lens, towards = sampler.next_2d(), mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    ray, _ = sensor.sample_ray_differential(time, wavelength, sampler.next_2d(), lens)
+    si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+    si.compute_uv_partials(ray)
+    pixel = dr.select(turn, si.duv_dx, si.duv_dy)
+    n, uv = mi.Vector3f(si.n), mi.Point2f(si.uv)
+    wo = si.to_local(mi.Frame3f(dr.mulsign(n, -dr.dot(n, ray.d))).to_world(towards))
+    bsdf, values = si.bsdf(), []
+    for step in (0, STEP, 1):
+        si.uv = uv + step * pixel
+        seen = bsdf.eval(mi.BSDFContext(), si, wo) + si.emitter(scene).eval(si)
+        values.append(dr.mean(mi.unpolarized_spectrum(seen)))
+    near, far = dr.abs(values[1] - values[0]) / STEP, dr.abs(values[2] - values[0])
+    shape = dr.reinterpret_array(mi.UInt32, si.shape)
+    usable = si.is_valid() & dr.isfinite(near) & dr.isfinite(far)
+    return dr.select(usable, near, 0), dr.select(usable, far, 0), dr.select(usable, shape, 0)
