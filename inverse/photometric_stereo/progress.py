@@ -30,7 +30,7 @@ SELDOM = 20
 
 #: Of a checkpoint: fields of a `Progress` that are states, of a `Course` that are numbers, and of a `Guess` that are
 #: arrays.
-STATES, NUMBERS = ("start", "settled", "best"), ("most", "number", "worse")
+STATES, NUMBERS = ("start", "settled", "best", "distant"), ("most", "number", "worse")
 ARRAYS = ("normals", "albedo", "exposures", "weights", "base")
 
 
@@ -43,6 +43,8 @@ class Progress:
         surface, then those of other kinds of material.
     start : of this size, judged. settled : result of trial 0, or of the glossy one if that is better.
     best : of the trials that ended. course : of this trial.
+    away : distance of the lights, pixels of the full size, infinity if they are distant; None until it is known.
+    distant : with lights that are estimated to be near, the best state of the first size with distant ones.
     back : part of the surface that was taken back to the start at the end.
     history, seconds : as of `Result`.
     """
@@ -54,6 +56,8 @@ class Progress:
     settled: State | None = None
     best: State | None = None
     course: Course | None = None
+    away: float | None = None
+    distant: State | None = None
     back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -67,6 +71,11 @@ class Progress:
 
     def next_level(self, kind: Kind) -> None:
         self.kind, self.level, self.trial = kind, self.level + 1, 0
+        self.start = self.settled = self.best = None
+
+    def begin_again(self, away: float, distant: State | None) -> None:
+        """The first size, with lights at this distance. distant : as of the class."""
+        self.away, self.distant, self.trial = away, distant, 0
         self.start = self.settled = self.best = None
 
     def best_so_far(self) -> State:
@@ -105,6 +114,7 @@ class Checkpoint:
         began = time.monotonic()
         states = {name: getattr(now, name) for name in STATES}
         arrays, facts = {}, {"level": now.level, "trial": now.trial, "kind": dataclasses.astuple(now.kind)}
+        facts["away"] = now.away
         if (course := now.course) is not None:
             states |= {"newest": course.state, "best of course": course.best}
             facts["course"] = {name: getattr(course, name) for name in NUMBERS}
@@ -141,7 +151,7 @@ class Checkpoint:
         if "course" in facts:
             newest, best = states.pop("newest"), states.pop("best of course")
             course = Course(newest, best=best, indirect=arrays.get("indirect"), **facts["course"])
-        same = {name: facts[name] for name in ("level", "trial", "history", "seconds")}
+        same = {name: facts[name] for name in ("level", "trial", "away", "history", "seconds")}
         return Progress(kind=Kind(*facts["kind"]), **states, course=course, **same)
 
     def _check(self, facts: dict[str, Any]) -> None:
