@@ -30,7 +30,7 @@ SELDOM = 20
 
 #: Of a checkpoint: fields of a `Progress` that are states, of a `Course` that are numbers, and of a `Guess` that are
 #: arrays.
-STATES, NUMBERS = ("start", "settled", "best", "distant"), ("most", "number", "worse")
+STATES, NUMBERS = ("start", "settled", "best", "distant", "distant_start"), ("most", "number", "worse")
 ARRAYS = ("normals", "albedo", "exposures", "weights", "base")
 
 
@@ -44,7 +44,7 @@ class Progress:
     start : of this size, judged. settled : result of trial 0, or of the glossy one if that is better.
     best : of the trials that ended. course : of this trial.
     away : distance of the lights, pixels of the full size, infinity if they are distant; None until it is known.
-    distant : with lights that are estimated to be near, the best state of the first size with distant ones.
+    distant, distant_start : while near lights are tried, the best state and the start with distant ones.
     back : part of the surface that was taken back to the start at the end.
     history, seconds : as of `Result`.
     """
@@ -58,6 +58,7 @@ class Progress:
     course: Course | None = None
     away: float | None = None
     distant: State | None = None
+    distant_start: State | None = None
     back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -73,10 +74,16 @@ class Progress:
         self.kind, self.level, self.trial = kind, self.level + 1, 0
         self.start = self.settled = self.best = None
 
-    def begin_again(self, away: float, distant: State | None) -> None:
-        """The first size, with lights at this distance. distant : as of the class."""
-        self.away, self.distant, self.trial = away, distant, 0
-        self.start = self.settled = self.best = None
+    def try_near(self, away: float) -> None:
+        """The best state and the start of the first size are those with distant lights; now with near ones."""
+        self.away, self.distant, self.distant_start, self.best = away, self.best_so_far(), self.start, None
+
+    def end_near(self, found: State) -> None:
+        """Of the best state with near lights and that with distant ones, the better one counts."""
+        self.best, self.course = found, None
+        if not (found.better_than(self.distant) and found.beats(self.start)):
+            self.away, self.best, self.start = np.inf, self.distant, self.distant_start
+        self.distant = self.distant_start = None
 
     def best_so_far(self) -> State:
         """Of this size: of the trials that ended, the states of this one, and the start."""

@@ -251,8 +251,7 @@ class Reconstruction:
             result: Result | None = None
             while now.level < len(options.resolutions):
                 result = self._alternate(result)
-                if now.level or not self._lights_moved(result):
-                    now.next_level(result.kind)
+                now.next_level(result.kind)
             if options.descent.steps:
                 self._descend(result)
         return result
@@ -268,7 +267,7 @@ class Reconstruction:
         if self.scale != 1:
             level = dataclasses.replace(level, values=level.values * np.float32(self.scale))
         self.shown = level, Domain(level)
-        if now.away is not None and np.isfinite(now.away):
+        if now.level and np.isfinite(now.away):
             level = nearness.around(level, now.away * size)
         counts = start.counts(self.data, level, size, options.dark)
         method = start.method(self.data, level, size, options)
@@ -294,29 +293,40 @@ class Reconstruction:
                 unknown = np.nan if kind == now.settled.kind else np.inf
                 now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=unknown), most)
             now.end_trial(self.work.run(now.course, self._record, view), settles=glossy)
+        if now.level == 0:
+            self._try_near(level, judge)
         if now.level == len(options.resolutions) - 1:
             self._take_back()
         return self._result()
 
-    def _lights_moved(self, result: Result) -> bool:
-        """After the first size: must it be done again, with lights at another distance? With the one that the shading
-        tells, if it tells any; and with distant ones again if what was found with that one is no better."""
+    def _try_near(self, level: Dataset, judge: Judge) -> None:
+        """After the trials of the first size: go on from their best state with lights at the distance that the shading
+        tells, if it tells any. level : with distant lights."""
         now, options = self.now, self.options
-        if now.away is not None:
-            if now.distant is None or now.best_so_far().better_than(now.distant):
-                return False
-            now.begin_again(np.inf, None)
-            return True
-        now.away = np.inf
-        if options.near_lights and self.work.judge.able and not options.descent.steps:
-            best = now.best_so_far()
-            self._work_on(best)
-            now.away = nearness.distance(self.work, best) / options.resolutions[0]
+        size = options.resolutions[0]
+        if now.away is None:
+            now.away, best = np.inf, now.best_so_far()
+            if options.near_lights and judge.able and not options.descent.steps:
+                self._work_on(best)
+                now.away = nearness.distance(self.work, best) / size
+            if np.isfinite(now.away):
+                now.try_near(now.away)
+                self.bar.total += SETTLED
+        if now.distant is None:
+            return
+        near, kind, self.work = nearness.around(level, now.away * size), now.distant.kind, None
+        judge = dataclasses.replace(judge, data=near)
+        self.work = Alternations(near, self.lobes, kind, judge, options, self.rng)
+        if now.course is None:
+            lights = start.flat(near).lighting()
+            guess = start.guess(near, self.lobes, judge.counts, options, (judge.start, judge.usable))
+            now.start, _ = self.work.judged_start(guess, lights, self.kinds)
+            guess = copy.deepcopy(now.distant.guess)
+            now.course = Course(State(guess, self.work.integrate(guess), kind, left_out=np.inf), SETTLED)
+        now.end_near(self.work.run(now.course, self._record))
         if np.isinf(now.away):
-            return False
-        now.begin_again(now.away, now.best_so_far())
-        self.bar.total += options.iterations[0] + options.others()[0]
-        return True
+            self.work = None
+            self.work = Alternations(level, self.lobes, kind, dataclasses.replace(judge, data=level), options, self.rng)
 
     def _work_on(self, state: State) -> None:
         """With the kind of its material."""

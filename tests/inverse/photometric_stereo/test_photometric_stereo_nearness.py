@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from rimlight import ggx
+from rimlight.inverse import checkpoint
 from rimlight.inverse import photometric_stereo as ps
 from rimlight.inverse.photometric_stereo import nearness, progress, reconstruction, simulation
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import DirectModel, Guess
-from rimlight.inverse.photometric_stereo.evidence import Kind
 from rimlight.inverse.photometric_stereo.rendering import Domain
 from rimlight.inverse.photometric_stereo.vectors import unit
 
@@ -59,10 +59,12 @@ def test_distant_lights_stay_distant() -> None:
 
 
 def test_they_must_explain_more(lit_from_near: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A distance with which what is found is no better is given up."""
-    monkeypatch.setattr(nearness, "distance", lambda *_: 0.6 * N)
+    """A distance with which what is found is no better is given up, and what was found before counts."""
+    without = ps.reconstruct(lit_from_near, ps.Options(**QUICK, near_lights=False), progress=False)
+    monkeypatch.setattr(nearness, "distance", lambda *_: 1.2 * N)
     found = ps.reconstruct(lit_from_near, ps.Options(**QUICK), progress=False)
-    assert np.isinf(found.away) and len(found.history) > 4
+    assert np.isinf(found.away) and len(found.history) > len(without.history)
+    assert found.left_out == without.left_out and found.halves == without.halves
 
 
 def test_the_middle_stays_as_bright(lit_from_near: Dataset) -> None:
@@ -94,13 +96,24 @@ def test_lights_that_are_few_or_known_are_left_as_they_are(lit_from_near: Datase
     assert np.isinf(result.away) and run.now.away == np.inf
 
 
-def test_progress_keeps_them(lit_from_near: Dataset, tmp_path: Path) -> None:
-    """Killed after the first size, a reconstruction goes on with the same distance."""
-    run = reconstruction.Reconstruction(lit_from_near, ps.Options(**{**QUICK, "iterations": (1,)}))
-    run.keep(tmp_path / "run.npz", resume=False)
-    run.finish(False)
-    run.now.begin_again(123.0, run.now.distant)
-    run.file.save(run.now, run.rng)
-    loaded = progress.Checkpoint(tmp_path / "run.npz", run.data, run.options).load(run.rng)
-    assert loaded.away == 123.0 and loaded.kind == Kind() and loaded.start is None
-    np.testing.assert_array_equal(loaded.distant.guess.normals, run.now.distant.guess.normals)
+def test_killed_in_the_trial_they_go_on(
+    lit_from_near: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the same distance, to the same result."""
+    monkeypatch.setattr(progress, "SELDOM", 0)
+    options = ps.Options(**QUICK)
+    whole = ps.reconstruct(lit_from_near, options, progress=False)
+    assert np.isfinite(whole.away)
+    last = len(whole.history) - 1  # in the trial of near lights, which is the last one
+
+    def stop(result: ps.Result) -> None:
+        if len(result.history) == last:
+            raise KeyboardInterrupt
+
+    file = tmp_path / "run.npz"
+    with pytest.raises(KeyboardInterrupt):
+        ps.reconstruct(lit_from_near, options, progress=False, after=stop, checkpoint=file)
+    assert checkpoint.load(file)[1]["away"] == whole.away
+    found = ps.reconstruct(lit_from_near, options, progress=False, checkpoint=file, resume=True)
+    assert found.away == whole.away and len(found.history) == len(whole.history)
+    np.testing.assert_allclose(found.guess.normals, whole.guess.normals, atol=1e-4)
