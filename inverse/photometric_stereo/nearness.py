@@ -8,6 +8,7 @@ where its normal points, so the two can be told apart, unless the object is as r
 from __future__ import annotations
 
 import copy
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,8 @@ from .dataset import LUMINANCE, Dataset
 from .direct import HUBER, RIDGE, SAMPLED, TURN, DirectModel, Guess, without_turns
 from .evidence import Kind
 from .vectors import unit
+
+log = logging.getLogger(__name__)
 
 #: Fewest lights by which the distance is told, and least width of the object, pixels of the smallest images.
 FEWEST, SMALLEST = 20, 16
@@ -76,6 +79,8 @@ def distance(work: Alternations, state: State) -> float:
     view = work.view(state.guess, state.depth)
     counts = (work.judge.counts * view.seen).astype(np.float32)
     inverse, error = estimate(data, work.lobes, state.guess, state.kind, view, counts, work.judge.seed)
+    both = width(data) * inverse, width(data) * error
+    log.info("ps: widths of the object over the distance of the lights: %.3g ± %.2g", *both)
     return max(1 / inverse, LEAST * width(data)) if inverse > SURE * error else np.inf
 
 
