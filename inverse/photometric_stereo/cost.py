@@ -30,9 +30,10 @@ GROUPS = tuple(
 
 
 def memory(pixels: int, images: int, options: Options, *, near: bool = False) -> float:
-    """Bytes, at most. near : have the lights positions?"""
+    """Bytes, at most. near : have the lights positions? They may also get some."""
     values, finest = pixels * images, max(options.resolutions) ** 2
-    return FIXED + values * READING + finest * (values * (OF_VALUE + NEAR * near) + pixels * OF_PIXEL)
+    of_value = OF_VALUE + NEAR * (near or options.near_lights)
+    return FIXED + values * READING + finest * (values * of_value + pixels * OF_PIXEL)
 
 
 def seconds(pixels: int, images: int, options: Options, cores: int | None = None) -> float:

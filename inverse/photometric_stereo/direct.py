@@ -260,6 +260,23 @@ class DirectModel(Lighting):
 
     # ---------------------- BSDF ----------------------
 
+    def wanted(self, guess: Guess, coat: bool) -> np.ndarray:
+        """Which lobes a material may have, (B,), bool. coat : may diffuse light be that under a coat?"""
+        alpha, eta = np.array(self.lobes.alpha), np.array(self.lobes.eta)
+        return ~np.isnan(alpha) if guess.base is not None else ~(np.isnan(alpha) & ~np.isnan(eta)) | coat
+
+    def of_lobes(self, guess: Guess, pixels: np.ndarray) -> np.ndarray:
+        """Values of some pixels for a weight of 1 of each lobe, (P', K, B)."""
+        p, k = self._pairs(pixels)
+        point, frame = dr.gather(mi.Point3f, self.points, p), mi.Frame3f(dr.gather(mi.Vector3f, own(guess.normals), p))
+        direction, irradiance = self.light(k, point)
+        wi, wo = frame.to_local(self.view(point)), frame.to_local(direction)
+        scale = dr.gather(mi.Float, own(guess.albedo), p) * dr.gather(mi.Float, own(guess.exposures), k) * irradiance
+        factor = scale * dr.maximum(wo.z, 0)
+        found = [f * factor for f in ggx.lobes(self.lobes, wi, wo)]
+        dr.eval(found)  # in one kernel: NumPy would ask for one array after the other
+        return np.stack([f.numpy() for f in found], 1).astype(np.float64).reshape(len(pixels), self.K, len(self.lobes))
+
     def fit_bsdf(self, guess: Guess, rng: np.random.Generator, *, coat: bool = False, turn: bool = True) -> None:
         """Weights of the dictionary by non-negative least squares with a sum of at most 1, in place; where pixels have
         a diffuse colour of their own, only those of glossy lobes.
@@ -287,12 +304,7 @@ class DirectModel(Lighting):
             return table(found if colour is None else found + colour * (scale * own_lobe(n)))
 
         own_lobe = lambda n: diffuse(guess.base_eta, n, view, direction)
-        frame = mi.Frame3f(normal)
-        wi, wo = frame.to_local(view), frame.to_local(direction)
-        factor = scale * albedo * dr.maximum(wo.z, 0)
-        D = [f * factor for f in ggx.lobes(self.lobes, wi, wo)]
-        dr.eval(D)  # in one kernel: NumPy would ask for one array after the other
-        D = np.stack([f.numpy() for f in D], 1).astype(np.float64).reshape(count, self.K, B)
+        frame, D = mi.Frame3f(normal), self.of_lobes(guess, pixels)
         values, counts = dr.gather(mi.Color3f, self.values, entry), dr.gather(mi.Float, self.counts, entry)
         if self.indirect is not None:
             values -= dr.gather(mi.Color3f, self.indirect, entry)
@@ -305,12 +317,8 @@ class DirectModel(Lighting):
             values -= guess.base[pixels][:, None] * g
         columns = np.stack(own_columns, -1) if own_columns else np.zeros((*values.shape, 0))
         gram, moments = without_turns(D, columns, values, counts, shared=guess.base is not None)
-        alpha, eta, colours = np.array(self.lobes.alpha), np.array(self.lobes.eta), values.shape[2]
-        wanted = ~(np.isnan(alpha) & ~np.isnan(eta)) | coat
-        if guess.base is not None:
-            wanted = ~np.isnan(alpha)
-        parts = len(moments) // B
-        i, x = np.flatnonzero(np.tile(wanted, parts)), np.zeros(parts * B)
+        parts, colours = len(moments) // B, values.shape[2]
+        i, x = np.flatnonzero(np.tile(self.wanted(guess, coat), parts)), np.zeros(parts * B)
         if i.size:
             x[i] = simplex_least_squares(gram[np.ix_(i, i)], moments[i], parts)
         guess.weights = np.broadcast_to(x.reshape(parts, B).T, (B, colours)).copy()
@@ -363,12 +371,19 @@ def diffuse(eta: float, n: mi.Vector3f, v: mi.Vector3f, direction: mi.Vector3f) 
 
 
 def without_turns(
-    lobes: np.ndarray, turns: np.ndarray, values: np.ndarray, counts: np.ndarray, *, shared: bool = False
+    lobes: np.ndarray,
+    turns: np.ndarray,
+    values: np.ndarray,
+    counts: np.ndarray,
+    *,
+    shared: bool = False,
+    damping: float = DAMPING,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations of weights x, (C B,) for C colours, as if T numbers of each pixel followed, such as its normal.
 
     lobes : (P, K, B). turns : changes of the values with these numbers, (P, K, C, T). values : (P, K, C).
     counts : (P, K). shared : the weights are the same for all colours, (B,), as a glaze reflects all alike.
+    damping : of the T numbers: the more, the closer they stay to what they are.
 
     Returns
     -------
@@ -379,7 +394,7 @@ def without_turns(
     counted = turns * counts[..., None, None]
     A = np.swapaxes(counted.reshape(P, K * colours, T), 1, 2) @ turns.reshape(P, K * colours, T)
     diagonal = np.arange(T)
-    A[:, diagonal, diagonal] = A[:, diagonal, diagonal] * DAMPING + 1e-20
+    A[:, diagonal, diagonal] = A[:, diagonal, diagonal] * damping + 1e-20
     by_colour = [counted.sum(2)] if shared else [counted[:, :, c] for c in range(colours)]
     of_lobes = np.stack([transposed @ x for x in by_colour], 1).reshape(P, len(by_colour) * B, T)
     of_values = values.reshape(P, 1, K * colours) @ counted.reshape(P, K * colours, T)

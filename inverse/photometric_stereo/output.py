@@ -82,6 +82,7 @@ def write_numbers(
         "curl": {name: None if np.isnan(angle) else angle for name, angle in result.curl.items()},
         "taken_back": result.taken_back,
         "strength": None if np.isnan(result.strength) else result.strength,
+        "distance_of_lights_pixels": None if np.isinf(result.away) else result.away,
         "doubts": list(result.doubts),
         "seconds": round(result.seconds, 3),
         "size": [*data.mask.shape[::-1]],
@@ -156,6 +157,11 @@ def judgement(result: Result) -> list[str]:
         sentences.append(
             f"Interreflections of the surface that was found are multiplied by {result.strength:.2f}, so that shadows "
             "are as bright as in the images."
+        )
+    if np.isfinite(result.away):
+        sentences.append(
+            f"The shading tells that the lights are near: {result.away:.0f} pixels from the middle of the object. They "
+            "are taken to be all as far away, and the camera further."
         )
     if result.taken_back > 0:
         sentences.append(f"On {100 * result.taken_back:.2g} % of the surface, the normals are those of the start.")

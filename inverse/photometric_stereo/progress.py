@@ -30,7 +30,7 @@ SELDOM = 20
 
 #: Of a checkpoint: fields of a `Progress` that are states, of a `Course` that are numbers, and of a `Guess` that are
 #: arrays.
-STATES, NUMBERS = ("start", "settled", "best"), ("most", "number", "worse")
+STATES, NUMBERS = ("start", "settled", "best", "distant", "distant_start"), ("most", "number", "worse")
 ARRAYS = ("normals", "albedo", "exposures", "weights", "base")
 
 
@@ -43,6 +43,8 @@ class Progress:
         surface, then those of other kinds of material.
     start : of this size, judged. settled : result of trial 0, or of the glossy one if that is better.
     best : of the trials that ended. course : of this trial.
+    away : distance of the lights, pixels of the full size, infinity if they are distant; None until it is known.
+    distant, distant_start : while near lights are tried, the best state and the start with distant ones.
     back : part of the surface that was taken back to the start at the end.
     history, seconds : as of `Result`.
     """
@@ -54,6 +56,9 @@ class Progress:
     settled: State | None = None
     best: State | None = None
     course: Course | None = None
+    away: float | None = None
+    distant: State | None = None
+    distant_start: State | None = None
     back: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -68,6 +73,17 @@ class Progress:
     def next_level(self, kind: Kind) -> None:
         self.kind, self.level, self.trial = kind, self.level + 1, 0
         self.start = self.settled = self.best = None
+
+    def try_near(self, away: float) -> None:
+        """The best state and the start of the first size are those with distant lights; now with near ones."""
+        self.away, self.distant, self.distant_start, self.best = away, self.best_so_far(), self.start, None
+
+    def end_near(self, found: State) -> None:
+        """Of the best state with near lights and that with distant ones, the better one counts."""
+        self.best, self.course = found, None
+        if not (found.better_than(self.distant) and found.beats(self.start)):
+            self.away, self.best, self.start = np.inf, self.distant, self.distant_start
+        self.distant = self.distant_start = None
 
     def best_so_far(self) -> State:
         """Of this size: of the trials that ended, the states of this one, and the start."""
@@ -105,6 +121,7 @@ class Checkpoint:
         began = time.monotonic()
         states = {name: getattr(now, name) for name in STATES}
         arrays, facts = {}, {"level": now.level, "trial": now.trial, "kind": dataclasses.astuple(now.kind)}
+        facts["away"] = now.away
         if (course := now.course) is not None:
             states |= {"newest": course.state, "best of course": course.best}
             facts["course"] = {name: getattr(course, name) for name in NUMBERS}
@@ -141,7 +158,7 @@ class Checkpoint:
         if "course" in facts:
             newest, best = states.pop("newest"), states.pop("best of course")
             course = Course(newest, best=best, indirect=arrays.get("indirect"), **facts["course"])
-        same = {name: facts[name] for name in ("level", "trial", "history", "seconds")}
+        same = {name: facts[name] for name in ("level", "trial", "away", "history", "seconds")}
         return Progress(kind=Kind(*facts["kind"]), **states, course=course, **same)
 
     def _check(self, facts: dict[str, Any]) -> None:

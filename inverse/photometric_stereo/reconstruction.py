@@ -22,14 +22,14 @@ from tqdm import tqdm
 from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
-from . import least_squares, plausibility, start, taking_back
+from . import least_squares, nearness, plausibility, start, taking_back
 from .alternation import Alternations, Course, State, View
 from .dataset import Dataset
 from .direct import Guess
 from .evidence import Judge, Kind, left_out
 from .progress import Checkpoint, Progress
 from .refinement import Descent, descend
-from .rendering import Rendering
+from .rendering import Domain, Rendering
 
 #: Alternations from the normals of a glossy surface; of each kind of material, from the best state of the simplest, for
 #: with the normals of the start, anything may look like a coat. And at the largest size, of the same kind with a coat,
@@ -87,6 +87,8 @@ class Options:
     """Albedo of the brightest colour of a median pixel; of metal it is less, so that lobes explain its highlights. It
     sets the unknown scale of the images, on which the interreflections depend. 0: the scale is known, and values are
     radiances under lights of irradiance 1 (times intensity)."""
+    near_lights: bool = True
+    """Estimate how far away the lights are, where no file says it, there is no camera, and no descent."""
     seed: int = 0
     """Random seed."""
 
@@ -142,6 +144,8 @@ class Result:
     whose normals are those of the start.
     strength : by which factor interreflections were multiplied, for shadows to be as they are in the images; NaN if
     there are too few of these, and so they were left as they are.
+    away : distance of the lights from the middle of the object, pixels of the full size, if the shading told it;
+    infinity if it did not.
     doubts : what is probably wrong with the data, in sentences. history : for each alternation, the size of the images,
     seconds since the start, the root mean square residual over the median value, and where the truth is known the mean
     angular error, degrees."""
@@ -160,6 +164,7 @@ class Result:
     curl: dict[str, float] = field(default_factory=dict)
     taken_back: float = 0.0
     strength: float = np.nan
+    away: float = np.inf
     doubts: tuple[str, ...] = ()
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -261,6 +266,9 @@ class Reconstruction:
         level = self.data.at(size)
         if self.scale != 1:
             level = dataclasses.replace(level, values=level.values * np.float32(self.scale))
+        self.shown = level, Domain(level)
+        if now.level and np.isfinite(now.away):
+            level = nearness.around(level, now.away * size)
         counts = start.counts(self.data, level, size, options.dark)
         method = start.method(self.data, level, size, options)
         judge = Judge(level, self.lobes, left_out(level, options.seed), counts, options.seed, *method)
@@ -285,18 +293,53 @@ class Reconstruction:
                 unknown = np.nan if kind == now.settled.kind else np.inf
                 now.course = Course(dataclasses.replace(copy.deepcopy(now.settled), left_out=unknown), most)
             now.end_trial(self.work.run(now.course, self._record, view), settles=glossy)
+        if now.level == 0:
+            self._try_near(level, judge)
         if now.level == len(options.resolutions) - 1:
             self._take_back()
         return self._result()
+
+    def _try_near(self, level: Dataset, judge: Judge) -> None:
+        """After the trials of the first size: go on from their best state with lights at the distance that the shading
+        tells, if it tells any. level : with distant lights."""
+        now, options = self.now, self.options
+        size = options.resolutions[0]
+        if now.away is None:
+            now.away, best = np.inf, now.best_so_far()
+            if options.near_lights and judge.able and not options.descent.steps:
+                self._work_on(best)
+                now.away = nearness.distance(self.work, best) / size
+            if np.isfinite(now.away):
+                now.try_near(now.away)
+                self.bar.total += SETTLED
+        if now.distant is None:
+            return
+        near, kind, self.work = nearness.around(level, now.away * size), now.distant.kind, None
+        judge = dataclasses.replace(judge, data=near)
+        self.work = Alternations(near, self.lobes, kind, judge, options, self.rng)
+        if now.course is None:
+            lights = start.flat(near).lighting()
+            guess = start.guess(near, self.lobes, judge.counts, options, (judge.start, judge.usable))
+            now.start, _ = self.work.judged_start(guess, lights, self.kinds)
+            guess = copy.deepcopy(now.distant.guess)
+            now.course = Course(State(guess, self.work.integrate(guess), kind, left_out=np.inf), SETTLED)
+        now.end_near(self.work.run(now.course, self._record))
+        if np.isinf(now.away):
+            self.work = None
+            self.work = Alternations(level, self.lobes, kind, dataclasses.replace(judge, data=level), options, self.rng)
+
+    def _work_on(self, state: State) -> None:
+        """With the kind of its material."""
+        if self.work.kind != state.kind:
+            work, self.work = self.work, None
+            self.work = Alternations(work.data, self.lobes, state.kind, work.judge, self.options, self.rng)
 
     def _take_back(self) -> None:
         """To the start, what of the best state depends more on which lights tell it."""
         now, best = self.now, self.now.best_so_far()
         if best.start or not self.work.judge.able:
             return
-        if self.work.kind != best.kind:
-            work, self.work = self.work, None
-            self.work = Alternations(work.data, self.lobes, best.kind, work.judge, self.options, self.rng)
+        self._work_on(best)
         lights = start.flat(self.work.data).lighting()
         now.best, now.back = taking_back.taken_back(self.work, best, now.start, lights)
 
@@ -337,13 +380,14 @@ class Reconstruction:
     def _result(self) -> Result:
         """The best of what has been judged so far, at the present size."""
         now, work = self.now, self.work
-        best = now.best_so_far()
+        best, (data, domain), away = now.best_so_far(), self.shown, now.away or np.inf
+        size = self.options.resolutions[min(now.level, len(self.options.resolutions) - 1)]
         return Result(
-            work.data,
+            data,
             self.lobes,
             best.guess,
-            best.depth,
-            work.domain,
+            best.depth if np.isinf(away) else nearness.as_orthographic(best.depth, away * size),
+            domain,
             now.start.guess.normals,
             self.scale,
             best.kind,
@@ -353,6 +397,7 @@ class Reconstruction:
             curl={"start": now.start.curl, "result": best.curl},
             taken_back=1.0 if best.start else now.back,
             strength=best.strength,
+            away=away,
             doubts=self.data.doubts,
             history=now.history,
             seconds=now.seconds,

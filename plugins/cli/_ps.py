@@ -150,7 +150,8 @@ class Run:
         if needed > (there := cost.available_memory()):
             raise InputError(
                 f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
-                f"{there / 2**30:.1f} GiB are available; use fewer of the --images, or smaller --resolutions"
+                f"{there / 2**30:.1f} GiB are available; use fewer of the --images, smaller --resolutions, or "
+                "--no-near-lights"
             )
 
     def _reconstruct(self, data: dataset.Dataset, truth: np.ndarray | None) -> tuple[int, list[str]]:
