@@ -71,7 +71,7 @@ def test_plans_tell(variant):
         plan = rimlight.plan(stage(floor=floor)(), ["sensor.to_world"], integrator=integrator)
         rows[floor is fine] = plan.term("passing surfaces")
     assert rows[True].samples > 0 and rows[False].samples == 0
-    assert "fine textures move over the film" in rows[True].why and "no fine texture" in rows[False].why
+    assert "fine textures move over the film" in rows[True].reason and "no fine texture" in rows[False].reason
 
 
 @pytest.mark.parametrize("rfilter", ["box", "tent", "gaussian", "mitchell", "lanczos"])
