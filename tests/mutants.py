@@ -96,6 +96,12 @@ MUTANTS = [
         "e.density *= 1.02 * dr.select(emission,",
     ),
     # ---------------------- Signs, sides, velocities ----------------------
+    mutant(
+        "outlines of grids: across the tangents of triangles",
+        "edge_sampling/boundaries/grid_outlines.py",
+        "n, dr.select(known, turned, n_dl), active",
+        "n, n_dl, active",
+    ),
     mutant("film boundary: wrong sign", FILM, "jump -= sign * L * weight", "jump += sign * L * weight"),
     mutant(
         "edges from points: velocity of what is seen left out",
