@@ -65,8 +65,8 @@ def along_axis() -> mi.Scene:
     return scene(sensor=sensor, thing=grid(bsdf=diffuse(0.0, two_sided=True), values=torus(64)), **lamp("sky"))
 
 
-def ball() -> np.ndarray:
-    x = np.linspace(-1, 1, 32)
+def ball(n: int = 32) -> np.ndarray:
+    x = np.linspace(-1, 1, n)
     z, y, x = np.meshgrid(x, x, x, indexing="ij")
     return np.sqrt((x - 0.03) ** 2 + (y + 0.05) ** 2 + (z - 0.02) ** 2) - 0.7
 
@@ -84,8 +84,13 @@ def in_the_sun(values: Callable[[], np.ndarray]) -> mi.Scene:
     return scene(sensor=camera((0.3, 0.9, -3.0), (0, 0.5, 0)), thing=grid("analytic", values=values()), sun=sun)
 
 
-def black() -> dict[str, Any]:
-    return grid(n=32, bsdf=diffuse(0.0, two_sided=True), values=torus(32))
+def black(values: np.ndarray | None = None) -> dict[str, Any]:
+    return grid(bsdf=diffuse(0.0, two_sided=True), values=torus(32) if values is None else values)
+
+
+def few_values() -> mi.Scene:
+    """A black ball in a grid so coarse that its outline has corners."""
+    return scene(sensor=camera((0.63, 1.87, -3.4), (0, 0.45, 0)), thing=black(ball(12)), **lamp("sky"))
 
 
 def before_mirror() -> mi.Scene:
@@ -111,13 +116,14 @@ GROWS = {"key": "thing.grid", "direction": [-1.0]}
 LAMP = {"key": "lamp.vertex_positions", "direction": [1, 0, 0.5]}
 
 #: Cases whose references take more samples.
-LONGER = "grid_slides", "grid_in_mirror", "grid_behind_veil"
+LONGER = "grid_slides", "grid_of_few_values", "grid_in_mirror", "grid_behind_veil"
 
 #: Of each case: scene, motion, step, max_depth.
 GRIDS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "grid_slides": (on_floor, SLIDES, 6e-3, 2),
     "grid_slides_gaussian": (partial(on_floor, rfilter="gaussian"), SLIDES, 6e-3, 2),
     "grid_along_axis": (along_axis, SLIDES, 6e-3, 2),
+    "grid_of_few_values": (few_values, SLIDES, 6e-3, 2),
     "grid_slides_indirect": (on_floor, SLIDES, 6e-3, 3),
     "grid_grows": (on_floor, GROWS, 4e-3, 2),
     "grid_lamp": (on_floor, LAMP, 1e-2, 2),

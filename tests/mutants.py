@@ -96,7 +96,31 @@ MUTANTS = [
         "e.density *= 1.02 * dr.select(emission,",
     ),
     # ---------------------- Signs, sides, velocities ----------------------
+    mutant(
+        "outlines of grids: across the tangents of triangles",
+        "edge_sampling/boundaries/grid_outlines.py",
+        "n, dr.select(known, turned, n_dl), active",
+        "n, n_dl, active",
+    ),
     mutant("film boundary: wrong sign", FILM, "jump -= seen[-1]", "jump += seen[-1]"),
+    mutant(
+        "film boundary: motion of what is held left out",
+        FILM,
+        "value += L * dr.dot(points.n_dl, velocity)",
+        "value += 0 * L",
+    ),
+    mutant(
+        "passing surfaces: one side of a pixel left out",
+        "plugins/terms/passing.py",
+        "(sides[0] + sides[1])",
+        "(sides[0] + sides[0])",
+    ),
+    mutant(
+        "interior: change of the film area of what is held left out",
+        "plugins/terms/interior.py",
+        "stretch = rays.array(",
+        "stretch = 1 + 0 * rays.array(",
+    ),
     mutant(
         "edges from points: velocity of what is seen left out",
         SHADING,

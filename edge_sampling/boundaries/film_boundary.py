@@ -15,6 +15,7 @@ outlines of spheres, disks, cylinders and tubes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -29,13 +30,11 @@ from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 
 from .crease import Crease, Directions, LuneOrCrease
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
+from .grid_outlines import on_grids
 from .horizon import BESIDE, Horizon
 from .lune import Lune
 from .tracer import Tracer
 from .veils import behind_veils, is_veil
-
-#: How often the distance is halved in which the outline of a grid is known to be.
-HALVINGS = 6
 
 #: What perfect mirrors do, and all that lets light through.
 STRAIGHT = int(mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)
@@ -204,12 +203,12 @@ class FilmBoundary:
             u, p = dr.detach(u), dr.detach(p)
             active = found.valid & dr.isfinite(dr.squared_norm(n_dl)) & inside_frame(u, sensor.film())
             aside, reach = self._offset(scene, at, p, chosen, found)
-            n = dr.normalize(n_dl)
-            beside, rest, active = self._on_grid(tracer, at, sensor, chosen, found, u, p, (aside + reach) * n, active)
-            offset = (aside + rest * reach) * n
-            rays, weights = _beside(at, sensor, sampler, beside, offset, active)
+            look = partial(self._look, tracer, at, sensor)
+            around = aside + reach
+            beside, rest, n, n_dl, active = on_grids(outlines, at, look, chosen, found, u, p, n_dl, around, active)
+            rays, weights = _beside(at, sensor, sampler, beside, (aside + rest * reach) * n, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
-            active &= self._jumps_between(scene, at, chosen, found, p, dr.normalize(n_dl), rays, met)
+            active &= self._jumps_between(scene, at, chosen, found, p, n, rays, met)
             horizons = self._sides_of_horizons(at, chosen, found, p, rays, met)
             n_dl = dr.select(active, n_dl * found.forward, 0)
             shared = self._lune(at, chosen, lights, p, rays, met)
@@ -218,39 +217,12 @@ class FilmBoundary:
             sees = met, weights, active, horizons, shared, at.projection.attached, at.aperture_sample
             return BoundaryPoints(beside, n_dl, velocity, rays, *sees)
 
-    def _on_grid(self, tracer: Tracer, at: Placed, sensor, chosen: Chosen, found: Found, u, p, offset, active) -> tuple:
-        """Where the outline of a grid is, or a crease between its voxels, which are only known to be somewhere between
-        u − offset and u + offset: by bisection; the part of that distance that is left; and is it there?"""
-        edges, horizons = self.outlines.edges, self.outlines.horizons
-        if edges is None or not edges.grids.any:
-            return u, 1, active
-        outline = chosen.is_horizon & horizons.is_of_grid(chosen.face)
-        of_grid = outline | (chosen.is_edge & edges.grids.are(chosen.edge))
-        searched = active & of_grid
-
-        def side(part, active):
-            """What is met there: nothing (0), the grid (1), or which side of a crease (1, 2)."""
-            lens = mi.Point2f(0.5) if at.aperture_sample is None else at.aperture_sample
-            on_film = (u + part * offset - at.projection.crop_offset) / at.projection.crop_size
-            ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, on_film, lens, active)
-            si = self._on_surface(tracer.scene, ray, tracer.first_hit(ray, active), active)
-            side = edges.side_of_crease(at.positions, at.normals, chosen.edge, found.t, p, si)
-            surface = horizons.meets_grid(chosen.face, p, found.normal, ray, si)
-            return dr.select(outline, dr.select(surface, mi.UInt32(1), 0), side)
-
-        one = dr.full(mi.Float, 1, dr.width(u))
-        first, last = side(-one, searched), side(one, searched)
-        there = dr.select(outline, (first == 1) & (last == 0), edges.grids.parts(chosen.edge, first, last))
-        active, searched = active & (there | ~of_grid), searched & there
-
-        def halve(k, low, high):
-            middle = 0.5 * (low + high)
-            same = side(middle, searched) == first
-            return k + 1, dr.select(same, middle, low), dr.select(same, high, middle)
-
-        state = (dr.zeros(mi.UInt32, dr.width(u)), -one, one)
-        _, low, high = dr.while_loop(state, lambda k, *_: searched & (k < HALVINGS), halve, label="outlines of grids")
-        return u + dr.select(searched, 0.5 * (low + high), 0) * offset, 0.5 * (high - low), active
+    def _look(self, tracer: Tracer, at: Placed, sensor: mi.Sensor, u: mi.Point2f, active: mi.Bool) -> tuple:
+        """Rays at film positions, and the surfaces that they meet behind veils."""
+        lens = mi.Point2f(0.5) if at.aperture_sample is None else at.aperture_sample
+        on_film = (u - at.projection.crop_offset) / at.projection.crop_size
+        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, on_film, lens, active)
+        return ray, self._on_surface(tracer.scene, ray, tracer.first_hit(ray, active), active)
 
     # ---------------------- What is on their sides ----------------------
 

@@ -52,14 +52,18 @@ class Surfaces:
     def _differentiate(grid: mi.Shape, step: float, si, ray: mi.Ray3f, pi, active: mi.Bool) -> None:
         """Give what is met on a grid two vectors that are tangent to it, and the differences of normals along them."""
         on_grid = active & pi.is_valid() & (si.shape == mi.ShapePtr(grid))
-        found = []
+        found, here = [], mi.Vector3f(si.sh_frame.n)
         for along in mi.coordinate_system(si.n):
-            normals = []
+            changes = []
             for sign in (-1, 1):
                 beside = mi.Ray3f(ray)
                 beside.o = ray.o + sign * step * along
-                normals.append(pi.compute_surface_interaction(beside, mi.RayFlags.All, on_grid).sh_frame.n)
-            found.append((mi.Vector3f(along), (mi.Vector3f(normals[1]) - mi.Vector3f(normals[0])) / (2 * step)))
+                n = pi.compute_surface_interaction(beside, mi.RayFlags.All, on_grid).sh_frame.n
+                changes.append((mi.Vector3f(n) - here) * (sign / step))
+            # Where a crease is between, it is no derivative: on the other side of the point, there is none.
+            back, forth = changes
+            less = dr.squared_norm(back) < dr.squared_norm(forth)
+            found.append((mi.Vector3f(along), dr.select(less, back, forth)))
         (u, of_u), (v, of_v) = found
         si.dp_du, si.dp_dv = dr.select(on_grid, u, si.dp_du), dr.select(on_grid, v, si.dp_dv)
         si.dn_du, si.dn_dv = dr.select(on_grid, of_u, si.dn_du), dr.select(on_grid, of_v, si.dn_dv)
