@@ -118,8 +118,8 @@ MUTANTS = [
     mutant(
         "interior: change of the film area of what is held left out",
         "plugins/terms/interior.py",
-        "stretch = rays.array(",
-        "stretch = 1 + 0 * rays.array(",
+        '"stretch": rays.array(stretch)',
+        '"stretch": rays.array(0 * stretch + 1)',
     ),
     mutant(
         "edges from points: velocity of what is seen left out",

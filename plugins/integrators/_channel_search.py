@@ -41,7 +41,7 @@ class ChannelSearch(BoundarySearch):
         self.channels = channels
         self.kinds = {c.kind for c in channels}
 
-    def _find(self, scene: mi.Scene, moving: Moving, sppi: int) -> Boundaries:
+    def _find(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving, sppi: int) -> Boundaries:
         on_film = np.array([m or moving.camera for m in moving.flags], bool)
         film = None
         if on_film.any():

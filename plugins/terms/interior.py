@@ -33,14 +33,15 @@ class InteriorTerm(Term):
         if not job.counts.interior:
             return FilmSamples(position, Sample(mi.Spectrum(0), mi.Float(0)), ray.wavelengths, 1.0, job.weights)
         rays, held = Cut(job.mode), job.tracer.held
-        pi, stretch = None, 1.0
+        of_held = {}
         if held is not None:
             pi = job.tracer.first_hit(ray, True)
             # Used again in the kernels of the sensor's gradients.
             dr.eval(dr.detach(ray), pi)
             with dr.resume_grad():
-                stretch = rays.array(held.stretch(job.tracer.scene, ray, pi, held.are(ray, pi, mi.Bool(True))))
-        found = job.tracer.radiance(rays(ray), sampler, mi.Bool(True), attached=True, pi=pi, stretch=stretch)
+                stretch = held.stretch(job.tracer.scene, ray, pi, held.are(ray, pi, mi.Bool(True)))
+                of_held = {"pi": pi, "stretch": rays.array(stretch)}
+        found = job.tracer.radiance(rays(ray), sampler, mi.Bool(True), attached=True, **of_held)
         with dr.resume_grad():
             value = Sample(mi.Spectrum(found.L * ray_weight), mi.Float(0))
         weight = dr.detach(ray_weight)
