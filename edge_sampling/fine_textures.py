@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -23,11 +24,13 @@ RATIO = 4.0
 def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list[Any]:
     """Those among some shapes of which what they reflect, and emit, changes fast between two positions on the film that
     are close to each other, relative to what it changes over a pixel. Looks at some thousand rays."""
-    varying = [s for s in shapes if _varies(s)]
+    # Many shapes may share a material.
+    varies = cache(_varies)
+    varying = [s for s in shapes if varies(s.bsdf()) or (s.is_emitter() and varies(s.emitter()))]
     if not varying:
         return []
     with dr.suspend_grad():
-        near, far, of = (np.array(x) for x in _changes(scene, sensor))
+        near, far, of = (np.array(x) for x in _changes(scene, sensor, varying))
     found = []
     for shape in varying:
         own = of == int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(inner(shape)))[0])
@@ -37,14 +40,17 @@ def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list
     return found
 
 
-def _varies(shape: Any) -> bool:
-    below = objects_below(inner(shape)).values()
-    return any(isinstance(o, mi.Texture) and o.is_spatially_varying() for o in below)
+def _varies(owner: mi.Object) -> bool:
+    """Has a material or an emitter a texture? Of bump maps, Mitsuba 3.9 knows the slope of bitmaps alone."""
+    below = objects_below(owner).values()
+    textures = [o for o in below if isinstance(o, mi.Texture) and o.is_spatially_varying()]
+    bumpy = any(o.class_name() == "BumpMap" for o in below)
+    return bool(textures) and not (bumpy and any(not o.class_name().startswith("Bitmap") for o in textures))
 
 
-def _changes(scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.Float, mi.Float, mi.UInt32]:
-    """At many positions on the film, how much what is seen changes per pixel, over a short step, and over a whole
-    pixel of its texture; and the number of the shape."""
+def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.Float, mi.Float, mi.UInt32]:
+    """At many positions on the film, how much what is seen of some shapes changes per pixel, over a short step, and
+    over a whole pixel of its texture; and the number of the shape."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, RAYS)
     time, wavelength, turn = sensor.shutter_open(), sampler.next_1d(), sampler.next_1d() < 0.5
@@ -55,11 +61,18 @@ def _changes(scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.Float, mi.Float, mi
     pixel = dr.select(turn, si.duv_dx, si.duv_dy)
     n, uv = mi.Vector3f(si.n), mi.Point2f(si.uv)
     wo = si.to_local(mi.Frame3f(dr.mulsign(n, -dr.dot(n, ray.d))).to_world(towards))
-    bsdf, values = si.bsdf(), []
+    values = []
     for step in (0, STEP, 1):
         si.uv = uv + step * pixel
-        seen = bsdf.eval(mi.BSDFContext(), si, wo) + si.emitter(scene).eval(si)
-        values.append(dr.mean(mi.unpolarized_spectrum(seen)))
+        seen = mi.Spectrum(0)
+        # Not by virtual function calls, which would ask all materials that there are, those of other scenes included.
+        for bsdf in dict.fromkeys(s.bsdf() for s in shapes):
+            own = si.bsdf() == mi.BSDFPtr(bsdf)
+            seen += dr.select(own, mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, wo, own)), 0)
+        for emitter in dict.fromkeys(s.emitter() for s in shapes if s.is_emitter()):
+            own = si.emitter(scene) == mi.EmitterPtr(emitter)
+            seen += dr.select(own, mi.unpolarized_spectrum(emitter.eval(si, own)), 0)
+        values.append(dr.mean(seen))
     near, far = dr.abs(values[1] - values[0]) / STEP, dr.abs(values[2] - values[0])
     shape = dr.reinterpret_array(mi.UInt32, si.shape)
     usable = si.is_valid() & dr.isfinite(near) & dr.isfinite(far)

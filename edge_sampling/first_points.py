@@ -43,11 +43,11 @@ def seen_by_camera(
     """
     with dr.resume_grad(when=attached):
         si = surface_met(scene, ray, pi, mi.RayFlags.All, active)
+        if attached and held is not None:
+            there = held.are(pi, active)
+            si = dr.select(there, held.seen(scene, ray, pi, there), si)
         if attached:
             si = dr.select(grazes(si, ray.d, active), dr.detach(si), si)
-        if attached and held is not None:
-            there = held.are(ray, pi, active)
-            si = dr.select(there, held.seen(scene, ray, pi, there), si)
         return si
 
 
@@ -74,6 +74,12 @@ def can_hold(sensor: mi.Sensor) -> bool:
     return sensor.class_name() in (SENSORS[kind] for kind in ("perspective", "thinlens", "orthographic"))
 
 
+def has_points(shape: Any) -> bool:
+    """Can points of a shape be held? How those of grids, whose values may change, and of curves move is known in part
+    only."""
+    return shape.is_mesh() or shape.class_name() in ("Sphere", "Disk", "Cylinder", "Rectangle")
+
+
 @dataclass(frozen=True)
 class FirstPoints:
     """What a sensor sees of the shapes that are held. sensor : see `can_hold`."""
@@ -81,12 +87,10 @@ class FirstPoints:
     shapes: HeldShapes
     sensor: mi.Sensor
 
-    def are(self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
-        """Is what camera rays meet held? Not so where a curved surface is seen edge-on."""
+    def are(self, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
+        """Is what camera rays meet held?"""
         with dr.suspend_grad():
-            active = active & self.shapes.are(pi)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-            return active & ~grazes(si, ray.d, active)
+            return active & self.shapes.are(pi)
 
     def seen(
         self, scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
@@ -113,7 +117,7 @@ class FirstPoints:
         a, b = (projection.tangent(p, mi.Point3f(p + size * v), mi.Float(0), lens) for v in (frame.s, frame.t))
         area = (a.x * b.y - a.y * b.x) * Parametrisation(scene).area(pi, ray, si, active)
         now = dr.detach(area)
-        usable = active & (now != 0) & dr.isfinite(now)
+        usable = active & (now != 0) & dr.isfinite(now) & ~grazes(si, ray.d, active)
         return dr.replace_grad(mi.Float(1), dr.select(usable, area / dr.select(usable, now, 1), 1))
 
     def velocity(
@@ -126,7 +130,7 @@ class FirstPoints:
     ) -> mi.Vector2f:
         """Of what is held, on the film: mi.Vector2f, (N,), pixels; zero, with the gradient of the position; and 0 where
         nothing is held."""
-        active = self.are(ray, pi, active)
+        active = self.are(pi, active)
         p = material_point(dr.detach(ray), pi, active).p
         u = projection.film(_before(projection, p, active), aperture_sample).position()
         return dr.select(active, u - dr.detach(u), 0)

@@ -87,6 +87,17 @@ def stage(
     return build
 
 
+def ball() -> mi.Scene:
+    """A ball with a fine texture on a plain floor, in the sun."""
+    to_world = mi.ScalarTransform4f().translate([0.1, 0.4, 0.1]).rotate([0.6, 0.8, 0], 50).scale(0.6)
+    return scene(
+        sensor=camera(*LOOK, film=gaussian()),
+        floor=square("floor", (-2, -0.3, -1.4), (0, 0, 2.6), (4, 0, 0), diffuse(0.6, 0.5, 0.4)),
+        ball={"type": "sphere", "to_world": to_world, "bsdf": fine(1)["bsdf"]},
+        lamp=sun(),
+    )
+
+
 gaussian = lambda: film("gaussian")
 CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.2]}
 LOOK_UP = {"key": "sensor.to_world", "rotate": [1, 0.4, 0.3]}
@@ -100,6 +111,7 @@ FINE = {
     "fine_lens": (stage(kind="thinlens", aperture_radius=0.08, focus_distance=3.0), CAMERA, 1e-3, 2),
     "fine_wall": (stage(floor=lambda: diffuse(0.5), back=lambda: fine(1)), WALL, 1e-3, 2),
     "fine_box": (stage(floor=lambda: diffuse(0.5), box=lambda: fine(1), film=gaussian), BOX, 1e-3, 2),
+    "fine_ball": (ball, CAMERA, 1e-3, 2),
     "fine_patches": (stage(floor=patched), CAMERA, 1e-3, 2),
     "fine_soft_light": (stage(lamp=constant), CAMERA, 1e-3, 3),
     "fine_bumps": (stage(floor=bumpy), CAMERA, 1e-3, 2),

@@ -287,6 +287,12 @@ def outlines(scene: mi.Scene, geometry: Geometry, cracks: Cracks, moving: Moving
             f'the derivative is wrong for {listed(turned)}: the inverse of "to_world" is not the one that Mitsuba '
             "keeps. It takes the axis of `rotate` as it is: give it the length 1."
         )
+    stretched = names(s for s in moving.known if is_stretched(s) and has_its_inverse(s))
+    if stretched:
+        limits.append(
+            f"the derivative is wrong for {listed(stretched)}: Mitsuba shows balls, as if they were not stretched. "
+            "Scale them equally along all axes, or replace them by meshes."
+        )
     moves = lambda s: s in moving.on_film
     cut = sorted({tuple(sorted((a.id(), b.id()))) for a, b in cuts_of_others(scene, geometry) if moves(a) or moves(b)})
     if cut:
@@ -333,6 +339,14 @@ def of_tubes(scene: mi.Scene, geometry: Geometry, moving: Moving) -> list[str]:
             f"end, almost along them: rays miss them there. Let their radius grow by at most {STEEP:g} per length."
         )
     return limits
+
+
+def is_stretched(shape: Any) -> bool:
+    """Is it a sphere, scaled differently along different axes?"""
+    if not isinstance(shape, mi.Shape) or shape.class_name() != "Sphere":
+        return False
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)[:3, :3]
+    return bool(np.linalg.cond(matrix) > 1 + SHEARED)
 
 
 def has_its_inverse(shape: Any) -> bool:
@@ -429,7 +443,7 @@ def distant_scene(scene: mi.Scene) -> list[str]:
     ]
 
 
-#: How far a transformation times its inverse may be from the identity, without a warning.
+#: How far a transformation times its inverse may be from the identity, and that of a sphere from equal scales.
 SHEARED = 1e-3
 
 #: Largest coordinate of a scene, relative to its diagonal, up to which there is no warning.

@@ -40,7 +40,7 @@ from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.fine_textures import fine_textures
-from rimlight.edge_sampling.first_points import HeldShapes, can_hold
+from rimlight.edge_sampling.first_points import HeldShapes, can_hold, has_points
 from rimlight.edge_sampling.geometry.grids import Grids
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.interpolated import normals_turn, texture_slides
@@ -288,11 +288,11 @@ class BoundarySearch:
 
     def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
         """The shapes whose points are held where the camera sees them, since they have fine textures."""
+        is_held = lambda s: has_points(s) and s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)
         if not self.holds or not can_hold(sensor) or self.geometry.others:
             return None
         shapes = surfaces(scene) if moving.camera else list(dict.fromkeys(inner(s) for s in moving.shapes))
-        straight = lambda s: s.bsdf() is None or is_mirror(s) or lets_rays_through(s)
-        fine = fine_textures(scene, sensor, [s for s in shapes if not straight(s)])
+        fine = fine_textures(scene, sensor, [s for s in shapes if is_held(s)])
         return HeldShapes(scene, fine) if fine else None
 
     def _chains(

@@ -24,7 +24,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
      * - sppp
        - |int|
        - Samples per pixel of the film boundary (visibility as seen from the sensor); likewise, but without a number
-         in the scene at most 16 (width + height) for each sample per pixel.
+         in the scene at most 16 (width + height) for each sample per pixel. And of fine textures that move over the
+         film, without that limit.
 
      * - sppi
        - |int|
@@ -66,6 +67,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
             'type': 'direct_edge',
             'sppi': 0
     """
+
+    HOLDS = True
 
     #: Its paths end after direct illumination. `direct_projective` has these properties, and does not heed them either.
     IDLE = ("max_depth", "rr_depth")

@@ -71,6 +71,9 @@ class EdgeIntegrator(ADIntegrator):
     #: And as vertices of light subpaths see them?
     FROM_SURFACES = False
 
+    #: May points of fine textures be held where the camera sees them?
+    HOLDS = False
+
     #: Can samples be divided among its terms, see `balance`?
     BALANCES = True
 
@@ -97,7 +100,7 @@ class EdgeIntegrator(ADIntegrator):
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         options = {"planes": self.PLANES, "from_points": self.FROM_POINTS, "from_surfaces": self.FROM_SURFACES}
         # Tracers of others need not know of it.
-        options["holds"] = self.TRACER is PathTracer
+        options["holds"] = self.HOLDS and self.TRACER is PathTracer
         self.search = BoundarySearch(self.name, self.depths, **options)
         #: By what the samples of a term are multiplied, by its name; empty: all have as many. See `balance`.
         self.shares: dict[str, float] = {}

@@ -33,7 +33,8 @@ class PRBEdgeIntegrator(EdgeIntegrator):
      * - sppp
        - |int|
        - Samples per pixel of the film boundary (visibility as seen from the sensor); likewise, but without a number
-         in the scene at most 16 (width + height) for each sample per pixel.
+         in the scene at most 16 (width + height) for each sample per pixel. And of fine textures that move over the
+         film, without that limit.
 
      * - sppi
        - |int|
@@ -78,6 +79,7 @@ class PRBEdgeIntegrator(EdgeIntegrator):
     """
 
     OPTIONS = (*EdgeIntegrator.OPTIONS, "max_depth", "rr_depth")
+    HOLDS = True
 
     def __init__(self, props: mi.Properties):
         super().__init__(props, max_depth=props.get("max_depth", 6), rr_depth=props.get("rr_depth", 5))

@@ -194,8 +194,7 @@ class BisectionTerm(Term):
                 si = surface_met(job.tracer.scene, ray, at.a.pi, mi.RayFlags.All, on_line)
                 if job.tracer.held is not None:
                     # What is held there moves with the line, but for the motion of this over the surface.
-                    first = on_line & (at.a.depth == 1)
-                    first = job.tracer.held.are(at.a.ray, at.a.pi, first)
+                    first = job.tracer.held.are(at.a.pi, on_line & (at.a.depth == 1))
                     si = dr.select(first, surface_met(job.tracer.scene, at.a.ray, at.a.pi, FOLLOWS, first), si)
                 g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, si), 0), g)
             if border is not None:

@@ -36,13 +36,13 @@ def test_fine_textures_that_move_are_held(variant, key, shapes):
     assert held(stage()(), mi.load_dict({"type": "direct_edge"}), key) == shapes
 
 
-@pytest.mark.parametrize("what", ["no texture", "coarse texture", "mirror", "fisheye", "bdpt_edge"])
+@pytest.mark.parametrize("what", ["no texture", "coarse texture", "mirror", "fisheye", "bdpt_edge", "rig"])
 def test_what_is_not_held(variant, what):
     coarse = {"type": "bitmap", "bitmap": mi.Bitmap(np.float32([[0.1, 0.9], [0.7, 0.2]])), "raw": True}
     floors = {"no texture": lambda: diffuse(0.5), "coarse texture": lambda: {"type": "diffuse", "reflectance": coarse}}
     floors["mirror"] = lambda: {"type": "plastic", "diffuse_reflectance": fine()["bsdf"]["reflectance"]}
     view = {"kind": "fisheye", "fov": 120} if what == "fisheye" else {}
-    integrator = {"type": what, "max_depth": 3} if what == "bdpt_edge" else {"type": "direct_edge"}
+    integrator = {"type": what, "max_depth": 3} if what in ("bdpt_edge", "rig") else {"type": "direct_edge"}
     assert held(stage(floor=floors.get(what, fine), **view)(), mi.load_dict(integrator)) == []
 
 

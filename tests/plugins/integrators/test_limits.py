@@ -341,6 +341,14 @@ def test_axes_that_are_not_of_unit_length_are_warned_about(axis, size, count):
     assert all('wrong for "thing"' in m for m in messages)
 
 
+@pytest.mark.parametrize(("scale", "warned"), [((0.7, 0.7, 0.7), False), ((0.7, 0.6, 0.7), True)])
+def test_stretched_spheres_are_warned_about(scale, warned):
+    to_world = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 50).scale(list(scale))
+    ball = {"type": "sphere", "to_world": to_world, "bsdf": cases.diffuse(0.5)}
+    found = said(cases.scene(sensor=cases.camera(), ball=ball, sky=cases.constant()), "sensor.to_world")
+    assert len(found) == warned and all("stretched" in message for message in found)
+
+
 # ---------------------- Materials without a surface ----------------------
 
 
