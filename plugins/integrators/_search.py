@@ -103,6 +103,7 @@ class BoundarySearch:
         self._bent: list[tuple[mi.Shape, mi.BSDF]] = []
         self._beyond: dict[tuple, tuple[mi.Sensor, list[str]]] = {}
         self._boundaries: dict[tuple, Boundaries] = {}
+        self._fine: dict[tuple, HeldShapes | None] = {}
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor, sppi: int) -> Boundaries:
         """Find them for a frozen function, which is to be called next, and cannot look for itself."""
@@ -159,7 +160,7 @@ class BoundarySearch:
         # The scene before may be garbage by now. Nothing is traced yet, and `dr.freeze` may be about to record.
         self.geometry = self.edges = self._curves = self._rims = self._lines = self._textures = None
         self._sources = self._partial = self._media = None
-        self._boundaries, self._beyond, self._maps, self._bent = {}, {}, [], []
+        self._boundaries, self._fine, self._beyond, self._maps, self._bent = {}, {}, {}, [], []
         collect_before()
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
@@ -287,13 +288,17 @@ class BoundarySearch:
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, *others)
 
     def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
-        """The shapes whose points are held where the camera sees them, since they have fine textures."""
-        is_held = lambda s: has_points(s) and s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)
+        """The shapes whose points are held where the camera sees them, since they have fine textures. Found once, as
+        the first sensor sees them, for lines in which shapes cut each other may change with every step."""
         if not self.holds or not can_hold(sensor) or self.geometry.others:
             return None
-        shapes = surfaces(scene) if moving.camera else list(dict.fromkeys(inner(s) for s in moving.shapes))
-        fine = fine_textures(scene, sensor, [s for s in shapes if is_held(s)])
-        return HeldShapes(scene, fine) if fine else None
+        key = moving.camera, moving.flags
+        if key not in self._fine:
+            shapes = surfaces(scene) if moving.camera else list(dict.fromkeys(inner(s) for s in moving.shapes))
+            rough = [s for s in shapes if s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)]
+            fine = fine_textures(scene, sensor, [s for s in rough if has_points(s)])
+            self._fine[key] = HeldShapes(scene, fine) if fine else None
+        return self._fine[key]
 
     def _chains(
         self, scene: mi.Scene, moving: Moving, sppi: int
