@@ -24,14 +24,6 @@ def fine(seed: int = 0) -> dict[str, Any]:
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": bitmap(seed)}}
 
 
-def patched() -> dict[str, Any]:
-    """Sharp patches of a fine texture on a plain ground."""
-    weight = bitmap(3, 4, filter_type="nearest")
-    plain = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.1]}}
-    of = {"type": "blendbsdf", "weight": weight, "first": plain, "second": fine(1)["bsdf"]}
-    return {"type": "twosided", "bsdf": of}
-
-
 def bumpy() -> dict[str, Any]:
     """A rough metal with fine bumps."""
     slopes = np.random.default_rng(2).uniform(0.35, 0.65, (TEXELS, TEXELS, 3)).astype(np.float32)
@@ -112,7 +104,6 @@ FINE = {
     "fine_wall": (stage(floor=lambda: diffuse(0.5), back=lambda: fine(1)), WALL, 1e-3, 2),
     "fine_box": (stage(floor=lambda: diffuse(0.5), box=lambda: fine(1), film=gaussian), BOX, 1e-3, 2),
     "fine_ball": (ball, CAMERA, 1e-3, 2),
-    "fine_patches": (stage(floor=patched), CAMERA, 1e-3, 2),
     "fine_soft_light": (stage(lamp=constant), CAMERA, 1e-3, 3),
     "fine_bumps": (stage(floor=bumpy), CAMERA, 1e-3, 2),
 }

@@ -27,7 +27,7 @@ MORE_CASES = (
     "reflecting_ball light_out_of_frame sunk_cube_slides knot mirrored_sphere mirror_camera glass_tetrahedron "
     "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
     "hidden_picture box_behind_glass spike patchwork_camera stretched_ball lampshade_wall sunk_sphere_slides "
-    "pillar_turns strip_wall cut_bulb polished_camera polished_floor polished_rises "
+    "pillar_turns strip_wall cut_bulb polished_camera polished_floor polished_rises fine_camera fine_look fine_wall "
     "rippled_mirror checkers_throw checkers_beside lamp_slides coarse_normals coarse_slides coarse_hill"
 )
 

@@ -307,6 +307,12 @@ def _colours(texture: mi.Texture) -> list[Any]:
     return [v for key, v in mi.traverse(texture).items() if key.endswith(("data", "value"))]
 
 
+def is_continuous(texture: Any) -> bool:
+    """Is it a bitmap that does not jump, as far as its picture goes?"""
+    is_bitmap = texture.class_name().startswith("Bitmap")
+    return is_bitmap and not _jumps(texture, *_range(texture, np.array([[0.0, 0.0], [1.0, 1.0]])))
+
+
 def _jumps(texture: Any, lower: list[float], upper: list[float]) -> bool:
     """Does a texture jump between these coordinates?"""
     known, key = _KNOWN.get(), (id(texture), *lower, *upper)

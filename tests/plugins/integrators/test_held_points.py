@@ -46,7 +46,7 @@ def test_what_is_not_held(variant, what):
     assert held(stage(floor=floors.get(what, fine), **view)(), mi.load_dict(integrator)) == []
 
 
-@pytest.mark.parametrize("name", ["fine_look", "fine_lens", "fine_wall", "fine_box", "fine_patches"])
+@pytest.mark.parametrize("name", ["fine_look", "fine_lens", "fine_wall", "fine_box"])
 def test_backward_is_forward(variant, name):
     c = case(name)
     scene = c.scene()
