@@ -294,9 +294,16 @@ class BoundarySearch:
             return None
         key = moving.camera, moving.flags
         if key not in self._fine:
-            shapes = surfaces(scene) if moving.camera else list(dict.fromkeys(inner(s) for s in moving.shapes))
-            rough = [s for s in shapes if s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)]
-            fine = fine_textures(scene, sensor, [s for s in rough if has_points(s)])
+            # Not those that instances show: how held points move there has not been compared with differences.
+            shapes = (
+                scene.shapes() if moving.camera else [inner(s) for s in moving.shapes if not hasattr(s, "instance")]
+            )
+            rough = [
+                s
+                for s in shapes
+                if has_points(s) and s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)
+            ]
+            fine = fine_textures(scene, sensor, rough)
             self._fine[key] = HeldShapes(scene, fine) if fine else None
         return self._fine[key]
 
