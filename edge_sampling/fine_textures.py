@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from .geometry.meshes import inner, objects_below
-from .geometry.texture_lines import is_continuous
 
 #: Rays by which textures are looked at.
 RAYS = 2**14
@@ -42,12 +41,8 @@ def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list
 
 
 def _varies(owner: mi.Object) -> bool:
-    """Are all textures of a material, or of an emitter, continuous bitmaps? (Lines at which textures jump are found on
-    the film, and what is between them changes little.)"""
-    below = objects_below(owner).values()
-    textures = [o for o in below if isinstance(o, mi.Texture) and o.is_spatially_varying()]
-    bumpy = any(o.class_name() == "BumpMap" for o in below)
-    return bool(textures) and not bumpy and all(is_continuous(o) for o in textures)
+    """Does a material, or an emitter, have a texture?"""
+    return any(isinstance(o, mi.Texture) and o.is_spatially_varying() for o in objects_below(owner).values())
 
 
 def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.Float, mi.Float, mi.UInt32]:

@@ -44,7 +44,7 @@ def seen_by_camera(
     with dr.resume_grad(when=attached):
         si = surface_met(scene, ray, pi, mi.RayFlags.All, active)
         if attached and held is not None:
-            there = held.are(pi, active)
+            there = held.are(ray, pi, active)
             si = dr.select(there, held.seen(scene, ray, pi, there), si)
         if attached:
             si = dr.select(grazes(si, ray.d, active), dr.detach(si), si)
@@ -54,7 +54,7 @@ def seen_by_camera(
 class HeldShapes:
     """The shapes whose points are held."""
 
-    DRJIT_STRUCT = dict.fromkeys(("_held",))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("_held", "_shown"))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene, shapes: list[Any]):
         index = lambda s: int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(inner(s)))[0])
@@ -63,10 +63,13 @@ class HeldShapes:
         for shape in shapes:
             flags[index(shape)] = True
         self._held = mi.Bool(flags)
+        #: Do instances show some of them? Which shape is met on an instance, Mitsuba tells on GPUs only.
+        self._shown = any(s not in scene.shapes() for s in shapes)
 
-    def are(self, pi: mi.PreliminaryIntersection3f) -> mi.Bool:
-        """Is what is met on one of them?"""
-        return pi.is_valid() & dr.gather(mi.Bool, self._held, dr.reinterpret_array(mi.UInt32, pi.shape))
+    def are(self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
+        """Is what a ray meets on one of them?"""
+        met = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active) if self._shown else pi
+        return active & pi.is_valid() & dr.gather(mi.Bool, self._held, dr.reinterpret_array(mi.UInt32, met.shape))
 
 
 def can_hold(sensor: mi.Sensor) -> bool:
@@ -87,10 +90,10 @@ class FirstPoints:
     shapes: HeldShapes
     sensor: mi.Sensor
 
-    def are(self, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
+    def are(self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Is what camera rays meet held?"""
         with dr.suspend_grad():
-            return active & self.shapes.are(pi)
+            return self.shapes.are(dr.detach(ray), pi, active)
 
     def seen(
         self, scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
@@ -130,7 +133,7 @@ class FirstPoints:
     ) -> mi.Vector2f:
         """Of what is held, on the film: mi.Vector2f, (N,), pixels; zero, with the gradient of the position; and 0 where
         nothing is held."""
-        active = self.are(pi, active)
+        active = self.are(ray, pi, active)
         p = material_point(dr.detach(ray), pi, active).p
         u = projection.film(_before(projection, p, active), aperture_sample).position()
         return dr.select(active, u - dr.detach(u), 0)

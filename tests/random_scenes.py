@@ -33,13 +33,13 @@ import numpy as np
 #: Half of the difference between the two values of θ. Images move by a few hundredths of a pixel.
 STEP = 2e-3
 
-#: Samples per pixel of one image of the finite differences, and of one derivative.
+#: Samples per pixel of one image of the finite differences, as a rule, and of one derivative.
 REFERENCE_SPP, SPP = 1024, 256
 
 #: Images that such an image is the mean of: Mitsuba adds up samples in single precision, and sums of many equal ones
 #: are off by the same in all runs. About so much, relative to the image.
 PASSES = 4
-ROUNDING = REFERENCE_SPP / PASSES * 2**-24 / 8
+ROUNDING = 2**-24 / 8 / PASSES
 
 #: How many of each are made: at first, and when that does not suffice to tell right from wrong.
 STAGES = ((10, 6), (24, 24), (80, 96))
@@ -61,12 +61,14 @@ SPECIAL = {
     "mirrors": "perfect mirrors and glass show what points, spots and suns light (`random_mirrors.py`)",
     "meshes": "things are torn, turned round, cut through themselves, or one of many faces (`random_meshes.py`)",
     "polished": "most surfaces are polished: their highlights are narrow",
+    "textures": "nearly everything has textures, most of them fine (`random_textures.py`)",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 
 #: Kinds of lights; those without size are in the middle.
 LIGHTS = ("area", "ball", "disklight", "meshball", "point", "spot", "sun", "sky", "environment")
+HARD = LIGHTS[4:7]
 
 #: A projection whose standard error is above this tells nothing: more samples are taken.
 TELLING = 0.03
@@ -137,6 +139,7 @@ class RandomScene:
     move : puts all that changes where θ says.
     integrator : what is tested, as a dictionary; `max_depth` of its paths.
     label : what is in the scene.
+    reference_spp : samples per pixel of one image of the finite differences.
     """
 
     scene: mi.Scene
@@ -145,6 +148,7 @@ class RandomScene:
     integrator: dict[str, Any]
     max_depth: int
     label: str
+    reference_spp: int = REFERENCE_SPP
 
 
 class Generator:
@@ -197,7 +201,7 @@ class Generator:
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
-        direct = {"jumps": not self.glows, "beams": False, "mirrors": False}.get(self.special, direct)
+        direct = {"jumps": not self.glows, "beams": False, "mirrors": False, "textures": True}.get(self.special, direct)
         self.depth = depth = 2 if direct else self.longest()
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
@@ -510,7 +514,7 @@ class Generator:
 
     def make_light(self, i: int, before: list[str]) -> str:
         name = f"light{i}"
-        kind = self.pick(*{"beams": ("spot", "projector"), "mirrors": LIGHTS[4:7]}.get(self.special, LIGHTS))
+        kind = self.pick(*{"beams": ("spot", "projector"), "mirrors": HARD, "textures": HARD}.get(self.special, LIGHTS))
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
         centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])
@@ -656,6 +660,8 @@ def make(seed: int, sampler: str = "independent", home: bool = False, special: s
         from random_mirrors import MirrorGenerator as Kind
     elif special == "meshes":
         from random_meshes import MeshGenerator as Kind
+    elif special == "textures":
+        from random_textures import TextureGenerator as Kind
     else:
         Kind = Generator
     return Kind(seed, sampler, home, special).make()
@@ -809,7 +815,8 @@ def _compare(
                     still.move(mi.Float(θ))
                     seeds = range(PASSES * len(reference), PASSES * (len(reference) + 1))
                     passes = (
-                        mi.render(still.scene, integrator=path, spp=REFERENCE_SPP // PASSES, seed=s) for s in seeds
+                        mi.render(still.scene, integrator=path, spp=still.reference_spp // PASSES, seed=s)
+                        for s in seeds
                     )
                     images.append(sum(np.array(image, np.float64) for image in passes) / PASSES)
                 reference.append((images[0] - images[1]) / (2 * step))
@@ -823,7 +830,7 @@ def _compare(
                 derivative.append(np.array(image, np.float64))
                 if len(derivative) == 1:
                     row.backward = _backward(moving, integrator, seed, derivative[0])
-            rounding = ROUNDING * np.abs(images[0]) / (math.sqrt(2) * step)
+            rounding = ROUNDING * still.reference_spp * np.abs(images[0]) / (math.sqrt(2) * step)
             statistics(np.array(reference), np.array(derivative), row, rounding)
             if not row.finite or (row.agrees and (row.stage or not row.error > TELLING)):
                 break

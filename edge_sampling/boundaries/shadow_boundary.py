@@ -150,7 +150,7 @@ class ShadowBoundary:
 
         with dr.resume_grad():
             m = material_point(view.ray, view.seen, active).p
-            held, stands = m, tracer.held and tracer.held.are(view.seen, active)
+            held, stands = m, tracer.held and tracer.held.are(view.ray, view.seen, active)
             if view.slid is not None:
                 held = still_on_film(projection, m, shadow.facing, view.aperture_sample, active)
                 held = held if stands is None else dr.select(stands, m, held)

@@ -27,6 +27,7 @@ from .meshes import (
     inner,
     is_map,
     is_met,
+    jumps_at_every_edge,
     objects_below,
     pointer,
     surfaces,
@@ -107,11 +108,18 @@ class TextureLines:
     shapes : those whose own lines count.
     lights : those whose lines count.
     lit : shapes on which these count; None: on all.
+    sliding : shapes whose texture coordinates change.
     """
 
     DRJIT_STRUCT = dict.fromkeys(("_sizes", "_steps"))  # for `dr.freeze`
 
-    def __init__(self, shapes: Sequence[Any], lights: Sequence[mi.Emitter] = (), lit: Sequence[Any] | None = None):
+    def __init__(
+        self,
+        shapes: Sequence[Any],
+        lights: Sequence[mi.Emitter] = (),
+        lit: Sequence[Any] | None = None,
+        sliding: Sequence[Any] = (),
+    ):
         # Of each shape, lattices last, since the last line counts where several are found: the slopes of bump maps jump
         # there, and so may whether they turn away.
         of_shapes = [(s, [*mapped_horizons(s), *lattices(s)]) for s in shapes]
@@ -125,6 +133,8 @@ class TextureLines:
         #: Shapes, and the numbers of their functions.
         self._shapes = [(s, [next(numbers) for _ in kinds]) for s, kinds in of_shapes if kinds]
         self._of_lights, self._lit = list(numbers), lit
+        #: Meshes whose edges count for all that jumps there, and move with it.
+        self._at_edges = [s for s, _ in self._shapes if s.is_mesh() and s not in sliding and jumps_at_every_edge(s)]
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -141,6 +151,13 @@ class TextureLines:
     def has_own(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Does the shape of a point have lines of its own?"""
         return _is_one_of(si, [shape for shape, _ in self._shapes])
+
+    def jump_at_edges(self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
+        """Does what jumps between two faces of the mesh that is met jump at their edge, and not at a line?"""
+        if not self._at_edges:
+            return mi.Bool(False)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        return active & _is_one_of(si, self._at_edges)
 
     def between(self, a: mi.SurfaceInteraction3f, b: mi.SurfaceInteraction3f) -> Line:
         """The line between two points of a surface that are next to each other."""
@@ -305,12 +322,6 @@ def numbers_of_place(name: str, value: Any) -> list[Any]:
 
 def _colours(texture: mi.Texture) -> list[Any]:
     return [v for key, v in mi.traverse(texture).items() if key.endswith(("data", "value"))]
-
-
-def is_continuous(texture: Any) -> bool:
-    """Is it a bitmap that does not jump, as far as its picture goes?"""
-    is_bitmap = texture.class_name().startswith("Bitmap")
-    return is_bitmap and not _jumps(texture, *_range(texture, np.array([[0.0, 0.0], [1.0, 1.0]])))
 
 
 def _jumps(texture: Any, lower: list[float], upper: list[float]) -> bool:

@@ -51,6 +51,9 @@ LINES = 8
 #: How far from its outline Mitsuba may take a tube to be, relative to the radius.
 SLACK = 1e-4
 
+#: The same on GPUs, where OptiX meets tubes by a method of its own.
+SLACK_ON_GPUS = 1e-3
+
 
 class Tubes:
     """The outlines of tubes.
@@ -162,7 +165,8 @@ class Tubes:
         c, r = _blend(points, place)
         tilt = dr.dot(e, _blend(points, slope)[0])
         p = mi.Point3f(c + r * (e - d * (tilt / d2)))
-        return CurvePoint(p, tangent, inwards, inwards, ~rim, valid, dr.detach(r) * SLACK)
+        slack = SLACK_ON_GPUS if mi.variant().startswith("cuda") else SLACK
+        return CurvePoint(p, tangent, inwards, inwards, ~rim, valid, dr.detach(r) * slack)
 
     def _control(self, control: mi.Float, curve: mi.UInt32) -> list[mi.Vector4f]:
         """The four control points of the segment of a curve; attached."""

@@ -294,10 +294,7 @@ class BoundarySearch:
             return None
         key = moving.camera, moving.flags
         if key not in self._fine:
-            # Not those that instances show: how held points move there has not been compared with differences.
-            shapes = (
-                scene.shapes() if moving.camera else [inner(s) for s in moving.shapes if not hasattr(s, "instance")]
-            )
+            shapes = surfaces(scene) if moving.camera else dict.fromkeys(inner(s) for s in moving.shapes)
             rough = [
                 s
                 for s in shapes
@@ -330,7 +327,8 @@ class BoundarySearch:
         through veils."""
         shapes = surfaces(scene) if mirrors else dict.fromkeys(inner(s) for s in moving.with_lines)
         everywhere = mirrors or moving.camera or moving.lights
-        lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes)
+        sliding = [inner(s) for s in moving.sliding]
+        lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes, sliding)
         return lines if len(lines) else None
 
     def _in_reflected_light(

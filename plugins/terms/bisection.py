@@ -21,7 +21,7 @@ from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
 from rimlight.edge_sampling.geometry.device_edges import BEHIND, overhang, rounding
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
-from rimlight.edge_sampling.parametrisation import FOLLOWS, Vicinity
+from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
 from rimlight.edge_sampling.rays import lift
 from rimlight.transport.cut import Cut
@@ -194,8 +194,8 @@ class BisectionTerm(Term):
                 si = surface_met(job.tracer.scene, ray, at.a.pi, mi.RayFlags.All, on_line)
                 if job.tracer.held is not None:
                     # What is held there moves with the line, but for the motion of this over the surface.
-                    first = job.tracer.held.are(at.a.pi, on_line & (at.a.depth == 1))
-                    si = dr.select(first, surface_met(job.tracer.scene, at.a.ray, at.a.pi, FOLLOWS, first), si)
+                    first = job.tracer.held.are(at.a.ray, at.a.pi, on_line & (at.a.depth == 1))
+                    si = dr.select(first, job.tracer.held.seen(job.tracer.scene, ray, at.a.pi, first), si)
                 g = dr.select(at.on_texture, dr.select(on_line, textures.across(line, si), 0), g)
             if border is not None:
                 there = usable & border.found & at.on_cast_shadow

@@ -39,7 +39,7 @@ class InteriorTerm(Term):
             # Used again in the kernels of the sensor's gradients.
             dr.eval(dr.detach(ray), pi)
             with dr.resume_grad():
-                stretch = held.stretch(job.tracer.scene, ray, pi, held.are(pi, mi.Bool(True)))
+                stretch = held.stretch(job.tracer.scene, ray, pi, held.are(ray, pi, mi.Bool(True)))
                 of_held = {"pi": pi, "stretch": rays.array(stretch)}
         found = job.tracer.radiance(rays(ray), sampler, mi.Bool(True), attached=True, **of_held)
         with dr.resume_grad():

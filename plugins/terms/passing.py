@@ -97,7 +97,7 @@ class PassingTerm(Term):
         ray, weight = dr.detach(ray), dr.detach(weight)
         pi = job.tracer.first_hit(ray, True)
         lower, upper = frame(sensor.film())
-        there = held.are(pi, dr.all((u >= lower) & (u <= upper)))
+        there = held.are(ray, pi, dr.all((u >= lower) & (u <= upper)))
         L, _ = job.tracer.seen(ray, pi, sampler, there, None, None)
         L = dr.select(there, L * weight, 0)
         # The gradient of each number of the sensor is a kernel of its own: let none of them trace rays again.

@@ -367,6 +367,9 @@ class Chains:
             turns, same_face = (here.lobe ^ there.lobe) == 4, a.pi.prim_index == b.pi.prim_index
             parts = ~same_shape | here.seen.is_apart_from(there.seen, segment.length) | (turns & ~same_face)
             differ = here.seen.cells != there.seen.cells
+            if self.textures is not None:
+                # Where the camera sees it, the edge itself counts.
+                differ &= same_face | shown | ~self.textures.jump_at_edges(a.ray, a.pi, active)
             on_line = active & ~parts & ~grazes & (differ | (here.dark != there.dark))
             on_texture |= on_line & differ
             on_shadow |= on_line & ~differ

@@ -1,5 +1,7 @@
 """Points of fine textures are held where the camera sees them."""
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -7,9 +9,12 @@ import pytest
 from both_modes import assert_backward_is_forward
 from cases import CAMERA_X, case, diffuse
 from fine_textures import fine, stage
+from instances import stretched_ball
 
 import rimlight
-from rimlight.checks import Motion, derivative_image
+from rimlight.checks import FiniteDifferences, Motion, compare, derivative_image
+
+NOTHING_IS_HELD = "rimlight.integrators._search.fine_textures", lambda *_: []
 
 
 def held(scene, integrator, key="sensor.to_world"):
@@ -24,8 +29,9 @@ def held(scene, integrator, key="sensor.to_world"):
     u = mi.Point2f(*dr.meshgrid(*2 * [dr.linspace(mi.Float, 0.01, 0.99, 40)]))
     with dr.suspend_grad():
         ray, _ = scene.sensors()[0].sample_ray(0, 0.5, u, mi.Point2f(0.5))
-        pi = scene.ray_intersect_preliminary(ray)
-        return [s.id() for s in scene.shapes() if dr.any(found.are(pi) & (pi.shape == mi.ShapePtr(s)))]
+        si, pi = scene.ray_intersect(ray), scene.ray_intersect_preliminary(ray)
+        met = [(s, (si.shape == mi.ShapePtr(s)) | (si.instance == mi.ShapePtr(s))) for s in scene.shapes()]
+        return [s.id() for s, there in met if dr.any(found.are(ray, pi, there))]
 
 
 @pytest.mark.parametrize(
@@ -34,6 +40,31 @@ def held(scene, integrator, key="sensor.to_world"):
 )
 def test_fine_textures_that_move_are_held(variant, key, shapes):
     assert held(stage()(), mi.load_dict({"type": "direct_edge"}), key) == shapes
+
+
+@pytest.mark.parametrize("kind", ["checkerboard", "nearest", "bumpmap"])
+@pytest.mark.parametrize("apart", [False, True])
+def test_textures_that_jump_are_held_on_meshes_and_instances(variant, kind, apart):
+    scene = stretched_ball(kind, 12, apart)
+    key = "thing.vertex_positions" if apart else "thing.to_world"
+    assert held(scene, mi.load_dict({"type": "direct_edge"}), key) == ["thing"]
+
+
+@pytest.mark.parametrize("kind", ["checkerboard", "bumpmap"])
+def test_derivatives_are_the_same_if_nothing_is_held(variant, monkeypatch, kind):
+    """Lines of these textures lie on edges of the mesh; and at edges, the normals of bump maps jump by themselves."""
+    make = partial(stretched_ball, kind, 12, apart=True)
+    made = []
+    for _ in range(2):
+        scene = make()
+        motion = Motion(scene, "thing.vertex_positions", rotate=[1, 0.4, 0.7], pivot=[0.1, 0.7, 0])
+        integrator = mi.load_dict({"type": "direct_edge"})
+        made.append(np.array([derivative_image(scene, integrator, motion, spp=64, seed=i) for i in range(8)], float))
+        monkeypatch.setattr(*NOTHING_IS_HELD)
+    a, b = made
+    error = a.std(0, ddof=1) / np.sqrt(len(a))
+    agreement = compare(b, FiniteDifferences(a.mean(0), error, np.zeros_like(error), {}))
+    assert not agreement.faults(noise=0.1), str(agreement)
 
 
 @pytest.mark.parametrize("what", ["no texture", "coarse texture", "mirror", "fisheye", "bdpt_edge", "rig"])
@@ -59,7 +90,7 @@ def test_a_term_alone_is_what_it_is_without(variant, monkeypatch, without):
     scene = stage()()
     motion, integrator = Motion(scene, **CAMERA_X), {"type": "direct_edge", without: 0, "sppi": 0}
     alone = np.array(derivative_image(scene, mi.load_dict(integrator), motion, spp=4, seed=2))
-    monkeypatch.setattr("rimlight.integrators._search.fine_textures", lambda *_: [])
+    monkeypatch.setattr(*NOTHING_IS_HELD)
     again = np.array(derivative_image(scene, mi.load_dict(integrator), motion, spp=4, seed=2))
     np.testing.assert_allclose(alone, again, rtol=1e-5, atol=1e-5 * np.abs(again).max())
 
