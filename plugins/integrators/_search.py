@@ -187,7 +187,7 @@ class BoundarySearch:
         """All edges, in the order that `Silhouettes` wants."""
         edges, count = self.edges, sum(m.vertex_count() for m in geometry.meshes)
         if geometry.textures is not None:
-            edges += geometry.textures.as_edges(count + sum(lines.vertices for lines in geometry.lines))
+            edges += geometry.textures.as_edges(geometry.first_of_textures)
         for lines in geometry.lines:
             edges, count = lines.as_edges(edges, count), count + lines.vertices
         return edges
@@ -269,7 +269,7 @@ class BoundarySearch:
         turning, sppi = np.array(moving.turning, bool), sppi if moving.in_space else 0
         film = None
         if on_film.any() or turning.any():
-            film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft, turning=turning)
+            film = FilmBoundary(*self._with_textures(moving, edges), on_film, lights, soft=soft, turning=turning)
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi, horizons)
@@ -286,6 +286,20 @@ class BoundarySearch:
         chains = self._chains(scene, moving, sppi)
         others = LightChoice.of(scene), deep, lamps, horizons, held
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, *others)
+
+    def _textures_on_film(self, moving: Moving) -> list[int]:
+        """Of which meshes the camera sees the lines of textures as edges."""
+        found = self._textures.on_film(moving.sliding) if self.from_points else []
+        return [i for i in found if moving.camera or moving.flags[i]]
+
+    def _with_textures(self, moving: Moving, edges: Edges) -> tuple[Geometry, Edges]:
+        """The shapes with these lines, and all edges. edges : the others."""
+        meshes = self._textures_on_film(moving)
+        if not meshes:
+            return self.geometry, edges
+        geometry = replace(self.geometry, textures=self._textures)
+        edges = self._edges_of(geometry)
+        return geometry, edges.take((edges.of_textures(geometry) == 0) | np.isin(edges.mesh[:, 0], meshes))
 
     def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
         """The shapes whose points are held where the camera sees them, since they have fine textures. Found once, as
@@ -324,14 +338,14 @@ class BoundarySearch:
         fine, met = FineMirrors(mirrors) if mirrors else None, Surfaces(scene) if chains or textures else None
         return chains, fine, textures, shown, met
 
-    @staticmethod
-    def _texture_lines(scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
+    def _texture_lines(self, scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
         """The lines of textures, and of what lights throw, that move as seen from the camera, or in mirrors and
         through veils."""
         shapes = surfaces(scene) if mirrors else dict.fromkeys(inner(s) for s in moving.with_lines)
         everywhere = mirrors or moving.camera or moving.lights
-        lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes)
-        return lines if len(lines) else None
+        edges = [inner(self.geometry.meshes[i]) for i in self._textures_on_film(moving)]
+        lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes, edges)
+        return lines if lines.besides_edges or (mirrors and len(lines)) else None
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int, horizons: HorizonsAtPoints | None
