@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -17,13 +18,17 @@ RAYS = 2**14
 #: Distance on the film of two positions close to each other, pixels.
 STEP = 2**-6
 
-#: How much faster the light of a fine texture changes there than over a pixel.
-RATIO = 4.0
+#: How much faster the light of a fine texture changes there than over a pixel; and if it jumps along lines that are
+#: edges on the film.
+RATIO, RATIO_OF_LINES = 4.0, 16.0
 
 
-def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list[Any]:
+def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any], as_edges: Sequence[Any]) -> list[Any]:
     """Those among some shapes of which what they reflect, and emit, changes fast between two positions on the film that
-    are close to each other, relative to what it changes over a pixel. Looks at some thousand rays."""
+    are close to each other, relative to what it changes over a pixel. Looks at some thousand rays.
+
+    as_edges : shapes with lines that are edges on the film.
+    """
     # Many shapes may share a material.
     varies = cache(_varies)
     varying = [s for s in shapes if varies(s.bsdf()) or (s.is_emitter() and varies(s.emitter()))]
@@ -35,14 +40,18 @@ def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list
     for shape in varying:
         own = of == int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(inner(shape)))[0])
         slope, change = (np.square(x[own], dtype=np.float64).sum() for x in (near, far))
-        if slope > RATIO**2 * change:
+        ratio = RATIO_OF_LINES if shape in as_edges else RATIO
+        if slope > ratio**2 * change:
             found.append(shape)
     return found
 
 
 def _varies(owner: mi.Object) -> bool:
-    """Does a material, or an emitter, have a texture?"""
-    return any(isinstance(o, mi.Texture) and o.is_spatially_varying() for o in objects_below(owner).values())
+    """Does a material, or an emitter, have a texture? (Mitsuba 3.9 has no bump maps of other textures than bitmaps.)"""
+    below = objects_below(owner).values()
+    textures = [o for o in below if isinstance(o, mi.Texture) and o.is_spatially_varying()]
+    bumpy = any(o.class_name() == "BumpMap" for o in below)
+    return bool(textures) and not (bumpy and any(not o.class_name().startswith("Bitmap") for o in textures))
 
 
 def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.Float, mi.Float, mi.UInt32]:

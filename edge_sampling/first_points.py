@@ -62,7 +62,7 @@ class HeldShapes:
         flags = [False] * (1 + max((index(s) for s in surfaces(scene)), default=0))
         for shape in shapes:
             flags[index(shape)] = True
-        self._held = mi.Bool(flags)
+        self.shapes, self._held = shapes, mi.Bool(flags)
         #: Do instances show some of them? Which shape is met on an instance, Mitsuba tells on GPUs only.
         self._shown = any(s not in scene.shapes() for s in shapes)
 

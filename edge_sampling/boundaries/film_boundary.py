@@ -36,6 +36,10 @@ from .lune import Lune
 from .tracer import Tracer
 from .veils import behind_veils, is_veil
 
+#: A line of a texture is seen if what both rays meet is at most so many times as far from its plane as they are beside
+#: it.
+BENT = 4
+
 #: What perfect mirrors do, and all that lets light through.
 STRAIGHT = int(mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)
 
@@ -268,7 +272,9 @@ class FilmBoundary:
                 pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, chosen.is_edge)
                 for ray, pi in zip(rays, met, strict=True)
             ]
-            hidden = outlines.edges.is_hidden(at.positions, chosen.edge, p, eye, view, rays, surfaces)
+            # A line of a texture may lie along an edge, beyond which is another plane.
+            bent = BENT * outlines.beside_texture(at, chosen)
+            hidden = outlines.edges.is_hidden(at.positions, chosen.edge, p, eye, view, rays, surfaces, bent)
             grids = outlines.edges.grids
             if grids.any:
                 of = at.positions, at.normals, chosen.edge, found.t, p
@@ -352,6 +358,7 @@ class FilmBoundary:
                 to_viewer = mi.Vector3f(viewer) * dr.dot(projection.eye() - p, viewer)
             beside_edge = outlines.edges.farther(scene, at.positions, chosen.edge, p, to_viewer)
             farther = dr.select(chosen.is_edge, beside_edge, 0)
+            farther += outlines.beside_texture(at, chosen)
             if grids.any:
                 reach = dr.select(chosen.is_edge, grids.reach(chosen.edge), 0)
                 imprecise |= chosen.is_edge & grids.are(chosen.edge)

@@ -99,7 +99,7 @@ class FilmOutlines:
     """
 
     _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "near_cuts", "lines", "grids")
-    DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft", "textures", "pieces"))  # for `dr.freeze`
 
     def __init__(
         self,
@@ -112,11 +112,13 @@ class FilmOutlines:
         seams: bool,
     ):
         self.geometry, self.soft = geometry, soft
-        self.lines, self.grids = geometry.lines, grids_of(geometry)
+        self.lines, self.grids, self.textures = geometry.lines, grids_of(geometry), geometry.textures
         edges, faces = edges.of_meshes(moving, lines=geometry.any_line(moving)), geometry.faces(moving)
         # (Dr.Jit 1.5 cannot freeze empty arrays: if curves alone move, one face without area stands for all.)
         faces = faces if len(faces) else np.zeros((1, 3), np.uint32)
         self.edges = DeviceEdges(edges, geometry) if len(edges) else None
+        #: Of each edge, the number of the piece of a line of a texture that it is, plus 1; 0: it is none.
+        self.pieces = mi.UInt32(edges.of_textures(geometry)) if self.textures is not None else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
         #: Which edges are on meshes that reflect light from all directions, but from behind?
         known = [m.bsdf() if not is_grid(m) else None for m in geometry.meshes]
@@ -136,6 +138,14 @@ class FilmOutlines:
         #: of cuts through analytic shapes.
         cuts, of_curves = len(faces) if len(edges) else 0, (self.curves, self.near_cuts)
         self.counts = (len(edges), cuts, len(horizons), *(len(c) if c is not None else 0 for c in of_curves))
+
+    def beside_texture(self, at: Placed, chosen: Chosen) -> mi.Float:
+        """How much farther beside lines of textures to look: scene units."""
+        if self.pieces is None:
+            return mi.Float(0)
+        piece = dr.gather(mi.UInt32, self.pieces, chosen.edge)
+        there = chosen.is_edge & (piece > 0)
+        return dr.select(there, self.textures.beside(at.positions, dr.select(there, piece - 1, 0)), 0)
 
     @property
     def any_smooth(self) -> bool:

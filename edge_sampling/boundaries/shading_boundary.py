@@ -42,6 +42,7 @@ from .lune import Lune, spreads
 from .near_lamps import share_at_first
 from .past_edges import look, turning
 from .tracer import ShadingPoint, Tracer
+from .veiled_lamps import VeiledLamps
 from .veils import has_veils, is_veil
 
 #: Directions that are sampled from a BSDF, to find its peak.
@@ -73,8 +74,8 @@ class ShadingBoundary:
     """
 
     _NUMBERS = ("transmits", "glossy", "smooth", "soft", "veils", "emission", "emission_at_first", "several", "crossed")
-    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps", "from_edges", "horizons")
-    DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS))  # for `dr.freeze`
+    _PARTS = ("silhouettes", "boxes", "moving_shapes", "lights", "smooth_lamps", "bent_lamps", "from_edges")
+    DRJIT_STRUCT = dict.fromkeys((*_PARTS, *_NUMBERS, "horizons", "veiled"))  # for `dr.freeze`
 
     def __init__(
         self,
@@ -102,6 +103,7 @@ class ShadingBoundary:
         self.crossed_lamps = self.crossed and any(s.is_emitter() for s in sliding)
         #: All that are no points or directions, whether Mitsuba samples them or not ("sampling_weight" may be 0).
         lights = [i for i, e in enumerate(emitters) if not e.flags() & mi.EmitterFlags.Delta]
+        self.veiled = VeiledLamps(scene, lights, self.boxes, moving)
         self.lights = mi.UInt32(lights or [0])  # Dr.Jit 1.5 cannot freeze empty arrays
         self.emission = bool(lights)
         flags = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
@@ -140,9 +142,7 @@ class ShadingBoundary:
             gradients are then complete before they are passed on, which takes one kernel, and not two.
         choice : see `sample_edge`.
 
-        Returns
-        -------
-        mi.Spectrum, (N,): zero, with the gradient of the reflected radiance.
+        Returns: mi.Spectrum, (N,), zero, with the gradient of the reflected radiance.
         """
         near = self._near(tracer, placement, point, sampler)
         point = point if near is None else near.point
@@ -174,7 +174,7 @@ class ShadingBoundary:
             scattering = active & tracer.scatters(point.depth + 1) & tracer.scatters(2)
             facing = mi.Vector3f(0) if self.transmits else si.n * dr.sign(dr.dot(si.n, si.to_world(si.wi)))
             number, p_light = self._choose(tracer, si.p, facing, sampler, emission)
-            cone = self.boxes.cone(number, si.p)
+            cone, aim = self.boxes.cone(number, si.p), self.veiled.aim(si.p, sampler)
             light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), number, emission)
             to_lamp = division_of(tracer.lamps, point.turning, light)
             if not self.emission_at_first:
@@ -199,11 +199,11 @@ class ShadingBoundary:
                 # the tree takes for open ones.
                 radius = dr.select(emitted, 0, dr.inf if self.veils else division.vicinity.radius)
                 ball = Vicinity(radius) if tracer.scatters(2) else None
-                cos = dr.select(emitted, cone.cos, -1)
-                towards = replace(view, cone=Cone(cone.axis, cos, cone.sin), vicinity=ball)
+                wide, aimed = Cone(cone.axis, mi.Float(-1), cone.sin), ~emitted & aim.taken
+                towards = replace(view, cone=dr.select(emitted, cone, aim.cone(wide)), vicinity=ball)
                 # What is seen past an edge that stands still may move. What emits does not: else all would be in one
                 # group.
-                still = dr.select(moves | point.slides, 1, dr.select(emitted, 0, STILL))
+                still = dr.select(moves | point.slides | aimed, 1, dr.select(emitted, 0, STILL))
                 use = [1, still][: self.silhouettes.groups]
                 e = self.silhouettes.sample(placement, towards, sampler, use, choice=part, active=active)
                 outline = self.silhouettes.point(placement, e, si.p)
@@ -216,15 +216,15 @@ class ShadingBoundary:
                 near = 1 - division.held(r2, ω)
                 near = dr.select(emitted, near, dr.maximum(near, VEILED)) if self.veils else near
                 crease = self.silhouettes.crease(e, outline) * near
-                # The closer an edge is, the faster its direction turns.
-                turn = dr.rsqrt(r2) * self.silhouettes.preferred(e, use)
-                whole = seen_past | outline.is_line | outline.crosses
-                return e, dr.max(f) * arc * turn * dr.select(whole, 1, crease)
+                # The closer an edge is, the faster its direction turns; but behind a veil, as fast as that is close.
+                turn = dr.select(aimed, 1, dr.rsqrt(r2)) * self.silhouettes.preferred(e, use)
+                jumps = dr.select(seen_past | outline.is_line | outline.crosses, 1, crease)
+                return e, dr.max(f) * arc * turn * dr.select(emitted | aim.counts(ω), jumps, 0)
 
             many = tracer.scatters(2) or tracer.lamps is not None
             number = MORE if self.glossy or self.veils else CANDIDATES if many else 1
             e, emission = chosen_edge(candidate, number, choice, emission, scattering, sampler)
-            e.density *= dr.select(emission, p_light, 1)
+            e.density *= dr.select(emission, p_light, aim.part)
             return e, emission, light, active, to_lamp
 
     def _near(self, tracer: Tracer, placement: Placement, point: ShadingPoint, sampler: mi.Sampler) -> FromEdge | None:

@@ -147,6 +147,7 @@ class DeviceEdges:
         view: mi.Vector3f | None,
         rays: list[mi.Ray3f],
         met: list[mi.SurfaceInteraction3f],
+        farther: mi.Float,
     ) -> mi.Bool:
         """Do two rays, close by on both sides of an edge, meet something else than what joins there?
 
@@ -157,14 +158,15 @@ class DeviceEdges:
         both of its faces, as it does unless one is narrower than the rays are apart.
 
         p : a point of the edge that the rays pass, world space. eye, view : see `is_boundary`.
-        met : what the rays meet. What lets rays through hides nothing.
+        met : what the rays meet. What lets rays through hides nothing. farther : how much farther they may be from the
+        planes of its faces than rounding explains, scene units.
         """
         a, b = self.end_points(positions, edge)
         normals = [dr.normalize(dr.cross(b - a, o - a)) for o in self.opposite(positions, edge)]
         covers, shown, crack = [], [], self._crack(positions, edge)
         for ray, si in zip(rays, met, strict=True):
             through = self._lets_through(si)
-            slack = rounding(p, ray.o) + crack
+            slack = rounding(p, ray.o) + crack + farther
             passed = [passes(ray, p, [a, b, o]) for o in self.opposite(positions, edge)]
             there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
             covers.append(passed[0] & passed[1])

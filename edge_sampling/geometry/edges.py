@@ -90,6 +90,11 @@ class Edges:
         """The edges that have a face in one of the meshes for which `wanted` (bool) holds. lines : and all lines?"""
         return self.take(np.where(self.is_line, lines, wanted[self.mesh].any(axis=1)))
 
+    def of_textures(self, geometry: Geometry) -> np.ndarray:
+        """The number of the piece of a line of a texture that each edge is, plus 1, or 0: (E,), uint32."""
+        vertex, first = self.vertices[:, 0, 0].astype(np.int64), geometry.first_of_textures
+        return np.where(vertex >= first, vertex - first + 1, 0).astype(np.uint32)
+
     def summary(self) -> dict[str, int]:
         counts = np.bincount(self.kind, minlength=len(EdgeKind))
         return {"edges": len(self), "open": int(self.open.sum()), **{k.name.lower(): int(counts[k]) for k in EdgeKind}}

@@ -88,6 +88,11 @@ class Geometry:
         analytic = tuple(dr.grad_enabled(mi.traverse(s)["to_world"]) for s in self.analytic)
         return meshes + analytic + tuple(dr.grad_enabled(mi.traverse(s)["control_points"]) for s in self.tubes)
 
+    @property
+    def first_of_textures(self) -> int:
+        """Number of the first vertex of `textures`."""
+        return sum(m.vertex_count() for m in self.meshes) + sum(lines.vertices for lines in self.lines)
+
     def positions(self) -> mi.Float:
         """Vertex positions of all meshes, one after the other: (3 V,), world space, scene units; attached."""
         of_meshes = [positions_of(m) for m in self.meshes]

@@ -1,7 +1,8 @@
 """Lines at which the textures of meshes jump, as edges: pieces of those of `texture_lines.py`, one for each triangle
 that a line crosses.
 
-Points of a path see them as they see edges. (What the camera sees of them is found on the film: `terms/bisection.py`.)
+The camera and points of a path see them as they see edges. (What has no such lines, and what mirrors show of them, is
+found on the film: `terms/bisection.py`.)
 A line moves with its triangle, and over it, if the texture coordinates change. A face belongs to both of its sides.
 """
 
@@ -15,7 +16,16 @@ import numpy as np
 
 from .edges import WHOLE, EdgeKind, Edges
 from .grids import is_grid
-from .meshes import Geometry, faces, has_texcoords, inner, texcoords_of, texture_coordinates, vertices
+from .meshes import (
+    Geometry,
+    faces,
+    has_texcoords,
+    inner,
+    jumps_at_every_edge,
+    texcoords_of,
+    texture_coordinates,
+    vertices,
+)
 from .texture_lines import lattices
 
 #: Vertices that stand for a piece: its two ends, and a point on each side of it.
@@ -67,6 +77,18 @@ class TextureEdges:
         """Those whose lines count. sliding : those over which they move."""
         known = {i: inner(self._meshes[i]) for i in self._lattices if i not in self._left_out}
         return [s for i, s in known.items() if not self._is_fine(i) or s in sliding]
+
+    def on_film(self, besides: Sequence[mi.Shape]) -> list[int]:
+        """Numbers of the meshes whose lines the camera sees as edges: of all that are not left out, but of `besides`,
+        and of those whose lines are not where their textures jump on some GPUs."""
+        return [
+            i
+            for i, found in self._lattices.items()
+            if self.capacities[i]
+            and i not in self._left_out
+            and inner(self._meshes[i]) not in besides
+            and not any(lattice.step for lattice in found)
+        ]
 
     def _is_fine(self, i: int) -> bool:
         return not self._every and self._across[i] > COARSE
@@ -121,6 +143,7 @@ class TextureEdges:
         self._left_out.discard(i)
         self._across[i] = 0
         inside = _edges_inside(np.concatenate([vertices(mesh), uv], 1), face)
+        inside &= not jumps_at_every_edge(mesh)  # its edges count by themselves
         which, rows = [np.zeros(0, np.int64)], [np.zeros((0, 4))]
         for lattice in self._lattices[i]:
             for row in lattice.matrix:

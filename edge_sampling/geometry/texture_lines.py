@@ -109,9 +109,11 @@ class TextureLines:
     lights : those whose lines count.
     lit : shapes on which these count; None: on all.
     sliding : shapes whose texture coordinates change.
+    elsewhere : shapes the jumps of whose textures are none, or edges of the film boundary, where the camera sees them
+        directly.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("_sizes", "_steps"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("_sizes", "_steps", "_elsewhere"))  # for `dr.freeze`
 
     def __init__(
         self,
@@ -119,6 +121,7 @@ class TextureLines:
         lights: Sequence[mi.Emitter] = (),
         lit: Sequence[Any] | None = None,
         sliding: Sequence[Any] = (),
+        elsewhere: Sequence[Any] = (),
     ):
         # Of each shape, lattices last, since the last line counts where several are found: the slopes of bump maps jump
         # there, and so may whether they turn away.
@@ -129,6 +132,10 @@ class TextureLines:
         #: The largest value of each function where the texture coordinates are at most 1.
         self._sizes = mi.Float([k.size for k in self.kinds] or [1])
         self._steps = mi.Float([getattr(k, "step", 0.0) for k in self.kinds] or [0])
+        others = [s in elsewhere and isinstance(kind, Lattice) for s, kinds in of_shapes for kind in kinds]
+        self._elsewhere = mi.Bool([*others, *(False for _ in of_lights)] or [False])
+        #: Are there any but those?
+        self.besides_those = len(self.kinds) > sum(others)
         numbers = iter(range(len(self.kinds)))
         #: Shapes, and the numbers of their functions.
         self._shapes = [(s, [next(numbers) for _ in kinds]) for s, kinds in of_shapes if kinds]
@@ -139,10 +146,12 @@ class TextureLines:
     def __len__(self) -> int:
         return len(self.kinds)
 
-    def cell(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
-        """A number for the part of a surface between the lines."""
+    def cell(self, si: mi.SurfaceInteraction3f, direct: mi.Bool) -> mi.UInt32:
+        """A number for the part of a surface between the lines. direct : does the camera see it, through veils at the
+        most? Then lines of `elsewhere` do not count."""
         found = mi.UInt32(0)
         for which, there in self._of(si):
+            there &= ~(direct & dr.gather(mi.Bool, self._elsewhere, which))
             at = mi.Point2i(dr.floor(self._at(which, si, there)))
             cell = mi.sample_tea_32(found ^ mi.UInt32(at.x), mi.UInt32(at.y))[0]
             found = dr.select(there, cell, found)

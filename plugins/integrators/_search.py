@@ -75,16 +75,15 @@ class BoundarySearch:
     planes : does its derivative have what the planes of faces do to soft light, where other normals shade?
     from_points : does it have boundaries as shading points see them?
     from_surfaces : and as vertices of light subpaths see them?
-    holds : may points of fine textures be held, as the first of its sensors sees them?
     """
 
     #: Nothing, for `dr.freeze`: what a frozen function depends on is what `find_boundaries` returns to it.
     DRJIT_STRUCT = dict.fromkeys(())
 
-    def __init__(
-        self, who: str, depths: Depths, *, planes: bool, from_points: bool, from_surfaces: bool, holds: bool = False
-    ):
-        self.who, self.depths, self.planes, self.holds = who, depths, planes, holds
+    def __init__(self, who: str, depths: Depths, *, planes: bool, from_points: bool, from_surfaces: bool):
+        self.who, self.depths, self.planes = who, depths, planes
+        #: May points of fine textures be held, as the first sensor sees them?
+        self.holds = False
         self.from_points, self.from_surfaces = from_points, from_surfaces
         self.geometry: Geometry | None = None
         self.edges: Edges | None = None
@@ -132,7 +131,7 @@ class BoundarySearch:
         if not self._checked:
             # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
             self._refuse_while_recording()
-        key = (*moving.key, sppi > 0, self.depths)
+        key = (*moving.key, sppi > 0, self.depths, self._may_hold(sensor))
         if key not in self._boundaries:
             self._refuse_while_recording()
             self._boundaries[key] = self._find(scene, sensor, moving, sppi)
@@ -187,7 +186,7 @@ class BoundarySearch:
         """All edges, in the order that `Silhouettes` wants."""
         edges, count = self.edges, sum(m.vertex_count() for m in geometry.meshes)
         if geometry.textures is not None:
-            edges += geometry.textures.as_edges(count + sum(lines.vertices for lines in geometry.lines))
+            edges += geometry.textures.as_edges(geometry.first_of_textures)
         for lines in geometry.lines:
             edges, count = lines.as_edges(edges, count), count + lines.vertices
         return edges
@@ -267,9 +266,11 @@ class BoundarySearch:
         seen = sppi and self.from_points and self.depths.scatters(2)
         horizons = HorizonsAtPoints.of(self.geometry, moving.turning) if seen and moving.anything else None
         turning, sppi = np.array(moving.turning, bool), sppi if moving.in_space else 0
-        film = None
+        film, at_rest = None, self._at_rest(scene, moving, held)
         if on_film.any() or turning.any():
-            film = FilmBoundary(self.geometry, edges, on_film, lights, soft=soft, turning=turning)
+            film = FilmBoundary(
+                *self._with_textures(moving, edges, at_rest), on_film, lights, soft=soft, turning=turning
+            )
         film = film if film is not None and any(film.outlines.counts) else None
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi, horizons)
@@ -283,14 +284,38 @@ class BoundarySearch:
         glass = glass and slides_behind_glass(scene, FacePlanes(scene).shapes)
         slides = Slides.BEHIND_GLASS if glass else Slides.NOTHING
         what = moving.flags, moving.camera, moving.lights
-        chains = self._chains(scene, moving, sppi)
+        chains = self._chains(scene, moving, sppi, at_rest)
         others = LightChoice.of(scene), deep, lamps, horizons, held
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, *others)
+
+    @staticmethod
+    def _at_rest(scene: mi.Scene, moving: Moving, held: HeldShapes | None) -> list[mi.Shape]:
+        """The shapes of which lines of textures do not move relative to what is held on both sides. (Through veils,
+        nothing is held.)"""
+        sliding = [inner(s) for s in moving.sliding]
+        return [s for s in held.shapes if s not in sliding] if held is not None and not has_veils(scene) else []
+
+    def _textures_on_film(self, moving: Moving, at_rest: list[mi.Shape]) -> list[int]:
+        """Of which meshes the camera sees the lines of textures as edges, besides those `at_rest`."""
+        found = self._textures.on_film([*moving.sliding, *at_rest]) if self.from_points else []
+        return [i for i in found if moving.camera or moving.flags[i]]
+
+    def _with_textures(self, moving: Moving, edges: Edges, at_rest: list[mi.Shape]) -> tuple[Geometry, Edges]:
+        """The shapes with these lines, and all edges. edges : the others."""
+        meshes = self._textures_on_film(moving, at_rest)
+        if not meshes:
+            return self.geometry, edges
+        geometry = replace(self.geometry, textures=self._textures)
+        edges = self._edges_of(geometry)
+        return geometry, edges.take((edges.of_textures(geometry) == 0) | np.isin(edges.mesh[:, 0], meshes))
+
+    def _may_hold(self, sensor: mi.Sensor) -> bool:
+        return self.holds and can_hold(sensor) and not self.geometry.others
 
     def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
         """The shapes whose points are held where the camera sees them, since they have fine textures. Found once, as
         the first sensor sees them, for lines in which shapes cut each other may change with every step."""
-        if not self.holds or not can_hold(sensor) or self.geometry.others:
+        if not self._may_hold(sensor):
             return None
         key = moving.camera, moving.flags
         if key not in self._fine:
@@ -300,12 +325,13 @@ class BoundarySearch:
                 for s in shapes
                 if has_points(s) and s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)
             ]
-            fine = fine_textures(scene, sensor, rough)
+            as_edges = [inner(self.geometry.meshes[i]) for i in self._textures_on_film(moving, [])]
+            fine = fine_textures(scene, sensor, rough, as_edges)
             self._fine[key] = HeldShapes(scene, fine) if fine else None
         return self._fine[key]
 
     def _chains(
-        self, scene: mi.Scene, moving: Moving, sppi: int
+        self, scene: mi.Scene, moving: Moving, sppi: int, at_rest: list[mi.Shape]
     ) -> tuple[bool, FineMirrors | None, TextureLines | None, ShownShadows | None, Surfaces | None]:
         """What has to be looked for on the film: see `Boundaries`, from `mirrors` on."""
         if not self.from_points:
@@ -314,22 +340,25 @@ class BoundarySearch:
         mirrors = [s for s in surfaces(scene) if is_mirror(s)] if shows else []
         # What is seen through veils lies where it is without them. So only what has no projection is looked for there.
         chains = bool(mirrors) or (self.depths.scatters(2) and has_veils(scene))
-        textures = self._texture_lines(scene, moving, chains)
+        textures = self._texture_lines(scene, moving, chains, at_rest)
         shown = ShownShadows(scene) if chains and sppi and self.depths.scatters(2) else None
         shown = shown if shown is not None and len(shown) else None
         chains = bool(mirrors) or (chains and bool(textures or shown))
         fine, met = FineMirrors(mirrors) if mirrors else None, Surfaces(scene) if chains or textures else None
         return chains, fine, textures, shown, met
 
-    @staticmethod
-    def _texture_lines(scene: mi.Scene, moving: Moving, mirrors: bool) -> TextureLines | None:
+    def _texture_lines(
+        self, scene: mi.Scene, moving: Moving, mirrors: bool, at_rest: list[mi.Shape]
+    ) -> TextureLines | None:
         """The lines of textures, and of what lights throw, that move as seen from the camera, or in mirrors and
         through veils."""
         shapes = surfaces(scene) if mirrors else dict.fromkeys(inner(s) for s in moving.with_lines)
         everywhere = mirrors or moving.camera or moving.lights
         sliding = [inner(s) for s in moving.sliding]
-        lines = TextureLines(shapes, scene.emitters(), None if everywhere else moving.shapes, sliding)
-        return lines if len(lines) else None
+        elsewhere = [*(inner(self.geometry.meshes[i]) for i in self._textures_on_film(moving, at_rest)), *at_rest]
+        lit = None if everywhere else moving.shapes
+        lines = TextureLines(shapes, scene.emitters(), lit, sliding, elsewhere)
+        return lines if lines.besides_those or (mirrors and len(lines)) else None
 
     def _in_reflected_light(
         self, scene: mi.Scene, moving: Moving, sppi: int, horizons: HorizonsAtPoints | None

@@ -16,7 +16,7 @@ from rimlight._collection import no_collection
 from rimlight._plan import Plan, names
 from rimlight.edge_sampling import Batch
 from rimlight.edge_sampling.boundaries.found import Boundaries
-from rimlight.edge_sampling.first_points import FirstPoints, can_hold
+from rimlight.edge_sampling.first_points import FirstPoints
 from rimlight.edge_sampling.geometry.instances import copied_places
 from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.order import TERMS
@@ -99,8 +99,6 @@ class EdgeIntegrator(ADIntegrator):
             raise InputError(f"{self.name}: polarised variants are not supported, got {mi.variant()}")
         self.sppc, self.sppp, self.sppi = (self._sample_count(props, key) for key in ("sppc", "sppp", "sppi"))
         options = {"planes": self.PLANES, "from_points": self.FROM_POINTS, "from_surfaces": self.FROM_SURFACES}
-        # Tracers of others need not know of it.
-        options["holds"] = self.HOLDS and self.TRACER is PathTracer
         self.search = BoundarySearch(self.name, self.depths, **options)
         #: By what the samples of a term are multiplied, by its name; empty: all have as many. See `balance`.
         self.shares: dict[str, float] = {}
@@ -297,8 +295,7 @@ class EdgeIntegrator(ADIntegrator):
         tracer = self.TRACER(scene, self)
         tracer.slides, tracer.lights, tracer.lamps = boundaries.slides, boundaries.lights, boundaries.lamps
         tracer.fine_mirrors = boundaries.fine_mirrors
-        # Without the film boundary, or the interior, the other one is to be what it is by itself.
-        if boundaries.held is not None and can_hold(sensor) and counts.interior and counts.film:
+        if boundaries.held is not None:
             tracer.held = FirstPoints(boundaries.held, sensor)
         return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.TERMS, self.shares)
 
@@ -401,6 +398,9 @@ class EdgeIntegrator(ADIntegrator):
 
     def _boundaries(self, scene, sensor, sppi, find=None) -> Boundaries:
         self.search.depths = self.depths
+        # Without the film boundary, or the interior, the other one is to be what it is by itself. Tracers of others
+        # need not know of it.
+        self.search.holds = self.HOLDS and self.TRACER is PathTracer and self.sppc != 0 and self.sppp != 0
         return (find or self.search.boundaries)(scene, sensor, sppi)
 
     def _warn(self, limits: Sequence[str]) -> None:

@@ -243,7 +243,7 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
     for v, w in ((at.a, other.a), (at.b, other.b)):
         same = v.pi.prim_index == w.pi.prim_index
         if chains.textures is not None:
-            cells = (chains.textures.cell(chains.surfaces.met(x.ray, x.pi, wanted)) for x in (v, w))
+            cells = (chains.textures.cell(chains.surfaces.met(x.ray, x.pi, wanted), mi.Bool(False)) for x in (v, w))
             same = dr.select(at.on_texture, operator.eq(*cells), same)
         usable &= (v.pi.shape == w.pi.shape) & (v.pi.instance == w.pi.instance) & same & (v.depth == w.depth)
     a, b = (dr.select(usable, new, old) for new, old in ((other.a, at.a), (other.b, at.b)))

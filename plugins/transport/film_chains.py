@@ -220,11 +220,14 @@ class Chains:
         ray = mi.Ray3f(self.rays.at(u, active)[0])
         return camera_vertex(ray, self.tracer.first_hit(ray, active))
 
-    def link(self, vertex: Vertex, ways: tuple[RayDerivative, ...], choice: mi.UInt32, active: mi.Bool) -> Link:
+    def link(
+        self, vertex: Vertex, ways: tuple[RayDerivative, ...], choice: mi.UInt32, shown: mi.Bool, active: mi.Bool
+    ) -> Link:
         """A vertex of a chain.
 
         ways : derivatives of the ray to it, the first along the axis on which what is seen is compared.
         choice : by which the chain chooses between what is reflected and what is let through.
+        shown : does a mirror or glass show it?
         """
         scene, ray, pi = self.tracer.scene, vertex.ray, vertex.pi
         met = active & pi.is_valid()
@@ -262,7 +265,7 @@ class Chains:
                 self._beyond_mapped(way, old, vertex, bsdf, numbers, mapped)
                 for way, old in zip(ways, beyond, strict=True)
             )
-        cells = dr.select(met, self.textures.cell(si), 0) if self.textures is not None else mi.UInt32(0)
+        cells = dr.select(met, self.textures.cell(si, ~shown), 0) if self.textures is not None else mi.UInt32(0)
         textured = met & self.textures.has_own(si) if self.textures is not None else mi.Bool(False)
         seen = Seen(
             dr.select(met, _shape_of(pi), 0),
@@ -323,7 +326,7 @@ class Chains:
             return self._cell(u, active)
 
         def step(vertex, derivative, seen, active):
-            link = self.link(vertex, (derivative,), choice, active)
+            link = self.link(vertex, (derivative,), choice, seen.shown, active)
             found = link.seen
             found.way = mi.sample_tea_32(seen.way, (found.way << 3) + link.lobe)[0]
             found.cells = mi.sample_tea_32(seen.cells, dr.select(link.dark, ~found.cells, found.cells))[0]
@@ -342,7 +345,8 @@ class Chains:
         met = active & vertex.pi.is_valid()
         seen = Seen.nothing(dr.width(u))
         seen.way = dr.select(met, _shape_of(vertex.pi), 0)
-        seen.cells = dr.select(met, self.textures.cell(self.surfaces.met(vertex.ray, vertex.pi, met)), 0)
+        si = self.surfaces.met(vertex.ray, vertex.pi, met)
+        seen.cells = dr.select(met, self.textures.cell(si, mi.Bool(True)), 0)
         return seen
 
     def part(
@@ -361,7 +365,7 @@ class Chains:
         aside = mi.Vector2f(axis.y, axis.x)
 
         def step(a, b, of_a, of_b, shown, on_texture, on_shadow, grazes, found, active):
-            here, there = self.link(a, of_a, choice, active), self.link(b, of_b, choice, active)
+            here, there = (self.link(*of, choice, shown, active) for of in ((a, of_a), (b, of_b)))
             same_shape = here.seen.way == there.seen.way
             # Is one of both on the wrong side of its face? If that is another face, they part at the edge.
             turns, same_face = (here.lobe ^ there.lobe) == 4, a.pi.prim_index == b.pi.prim_index

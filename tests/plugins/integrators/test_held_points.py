@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from both_modes import assert_backward_is_forward
 from cases import CAMERA_X, case, diffuse
-from fine_textures import fine, stage
+from fine_textures import bitmap, fine, stage
 from instances import stretched_ball
 
 import rimlight
 from rimlight.checks import FiniteDifferences, Motion, compare, derivative_image
-
-NOTHING_IS_HELD = "rimlight.integrators._search.fine_textures", lambda *_: []
 
 
 def held(scene, integrator, key="sensor.to_world"):
@@ -42,12 +40,33 @@ def test_fine_textures_that_move_are_held(variant, key, shapes):
     assert held(stage()(), mi.load_dict({"type": "direct_edge"}), key) == shapes
 
 
-@pytest.mark.parametrize("kind", ["checkerboard", "nearest", "bumpmap"])
-@pytest.mark.parametrize("apart", [False, True])
-def test_textures_that_jump_are_held_on_meshes_and_instances(variant, kind, apart):
-    scene = stretched_ball(kind, 12, apart)
-    key = "thing.vertex_positions" if apart else "thing.to_world"
-    assert held(scene, mi.load_dict({"type": "direct_edge"}), key) == ["thing"]
+@pytest.mark.parametrize("texels, is_held", [(8, False), (512, True)])
+def test_textures_that_jump_are_held_if_they_are_fine(variant, texels, is_held):
+    nearest = {"type": "diffuse", "reflectance": bitmap(0, texels, filter_type="nearest")}
+    scene, integrator = stage(floor=lambda: nearest)(), mi.load_dict({"type": "direct_edge"})
+    assert held(scene, integrator) == ["floor"] * is_held
+    (boundaries,) = integrator.search._boundaries.values()
+    assert (boundaries.film.outlines.textures is None) == is_held
+
+
+def test_fine_textures_of_instances_are_held(variant, monkeypatch):
+    """With as much noise as on an equal mesh; the derivative is the same if nothing is held."""
+    monkeypatch.setattr("instances.pictured", lambda kind: {"type": "diffuse", "reflectance": bitmap(3, 96)})
+    made = []
+    for apart in (False, True):
+        scene, integrator = stretched_ball(apart=apart), mi.load_dict({"type": "direct_edge"})
+        key = "thing.vertex_positions" if apart else "thing.to_world"
+        assert held(scene, integrator, key) == ["thing"]
+        motion = Motion(scene, key, rotate=[1, 0.4, 0.7], pivot=[0.1, 0.7, 0])
+        made.append(np.array([derivative_image(scene, integrator, motion, spp=64, seed=i) for i in range(8)], float))
+    assert_equal(*made, noise=0.1)
+
+
+def assert_equal(a, b, noise):
+    """Are two derivatives the same, up to noise?"""
+    error = a.std(0, ddof=1) / np.sqrt(len(a))
+    agreement = compare(b, FiniteDifferences(a.mean(0), error, np.zeros_like(error), {}))
+    assert not agreement.faults(noise=noise), str(agreement)
 
 
 @pytest.mark.parametrize("kind", ["checkerboard", "bumpmap"])
@@ -55,16 +74,13 @@ def test_derivatives_are_the_same_if_nothing_is_held(variant, monkeypatch, kind)
     """Lines of these textures lie on edges of the mesh; and at edges, the normals of bump maps jump by themselves."""
     make = partial(stretched_ball, kind, 12, apart=True)
     made = []
-    for _ in range(2):
+    for held_shapes in (lambda _scene, _sensor, shapes, _as_edges: shapes, lambda *_: []):
+        monkeypatch.setattr("rimlight.integrators._search.fine_textures", held_shapes)
         scene = make()
         motion = Motion(scene, "thing.vertex_positions", rotate=[1, 0.4, 0.7], pivot=[0.1, 0.7, 0])
         integrator = mi.load_dict({"type": "direct_edge"})
         made.append(np.array([derivative_image(scene, integrator, motion, spp=64, seed=i) for i in range(8)], float))
-        monkeypatch.setattr(*NOTHING_IS_HELD)
-    a, b = made
-    error = a.std(0, ddof=1) / np.sqrt(len(a))
-    agreement = compare(b, FiniteDifferences(a.mean(0), error, np.zeros_like(error), {}))
-    assert not agreement.faults(noise=0.1), str(agreement)
+    assert_equal(*made, noise=0.1)
 
 
 @pytest.mark.parametrize("what", ["no texture", "coarse texture", "mirror", "fisheye", "bdpt_edge", "rig"])
@@ -90,7 +106,7 @@ def test_a_term_alone_is_what_it_is_without(variant, monkeypatch, without):
     scene = stage()()
     motion, integrator = Motion(scene, **CAMERA_X), {"type": "direct_edge", without: 0, "sppi": 0}
     alone = np.array(derivative_image(scene, mi.load_dict(integrator), motion, spp=4, seed=2))
-    monkeypatch.setattr(*NOTHING_IS_HELD)
+    monkeypatch.setattr("rimlight.integrators._search.fine_textures", lambda *_: [])
     again = np.array(derivative_image(scene, mi.load_dict(integrator), motion, spp=4, seed=2))
     np.testing.assert_allclose(alone, again, rtol=1e-5, atol=1e-5 * np.abs(again).max())
 
