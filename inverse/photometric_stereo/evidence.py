@@ -193,9 +193,12 @@ class Judge:
             return turned.normals
 
         total, number = np.zeros(len(pixels)), np.zeros(len(pixels))
-        for half in halves(model.mean_directions()):
-            told = np.minimum(*((counts[:, part] > 0).sum(1) for part in (half, ~half))) >= TELLING
-            total += told * np.minimum(angles(found(half), found(~half)), FAR)
+        lit = self.data.lit  # what is without light would spoil the half that it is in
+        for first in halves(model.mean_directions()[lit]):
+            half, other = np.zeros((2, len(lit)), bool)
+            half[lit], other[lit] = first, ~first
+            told = np.minimum(*((counts[:, part] > 0).sum(1) for part in (half, other))) >= TELLING
+            total += told * np.minimum(angles(found(half), found(other)), FAR)
             number += told
         return np.divide(total, number, out=np.full(len(pixels), np.nan), where=number > 0)
 

@@ -226,7 +226,7 @@ class Reconstruction:
         if not mi.is_rgb or mi.is_polarized:
             raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
-        self.data, self.options, self.after = plausibility.checked(data), options, after
+        self.data, self.options, self.after = plausibility.checked(data, options.start), options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
         self.rng = np.random.default_rng(options.seed)

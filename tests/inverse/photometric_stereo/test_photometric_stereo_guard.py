@@ -123,6 +123,30 @@ def test_normals_of_halves_tell_a_wrong_model(matte: Dataset) -> None:
     assert np.isnan(judge.disagreement(guess, view.points, shown, None)).all()
 
 
+def test_images_without_light_spoil_no_half(matte: Dataset) -> None:
+    """Halves are those of the lights that shone, also of the start: it trims its values, which is robust against few
+    that are black."""
+    lobes, options, off = ggx.read_dictionary()[0], ps.Options(**QUICK), [1, 4]
+    values = matte.values.copy()
+    values[:, off] *= np.float32(0.01)
+    found = []
+    for data in (dataclasses.replace(matte, values=values), matte.without(off)):
+        counts = start.counts(data, data, 1.0, 0.0)
+        guess, plane = start.guess(data, lobes, counts, options), start.flat(data)
+        seen = np.ones(counts.shape, bool)
+        judge = Judge(data, lobes, left_out(data, 0), counts, 0, "trimmed")
+        guess.exposures = np.ones(len(data.lights))
+        points = np.array(plane.points).reshape(-1, 3)
+        found.append(judge.disagreement(guess, points, seen, None, lights=plane.lighting()))
+    assert list(np.flatnonzero(~counts_of(matte, values).any(0))) == off
+    np.testing.assert_allclose(*found, atol=1e-4)
+
+
+def counts_of(data: Dataset, values: np.ndarray) -> np.ndarray:
+    changed = dataclasses.replace(data, values=values)
+    return start.counts(changed, changed, 1.0, 0.0)
+
+
 @pytest.mark.parametrize("spp", [8, 2000])
 def test_small_images_are_smoothed_less_at_equal_noise(
     matte: Dataset, monkeypatch: pytest.MonkeyPatch, spp: int
