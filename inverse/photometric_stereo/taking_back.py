@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from .alternation import Alternations, State
+from .alternation import Alternations, State, View
 from .direct import DirectModel
 from .vectors import unit
 
@@ -24,15 +24,14 @@ SHARPNESS, LEAST = 8, 0.05
 
 
 def taken_back(
-    work: Alternations, best: State, start: State, lights: tuple[np.ndarray, np.ndarray]
+    work: Alternations, best: State, start: State, lights: tuple[np.ndarray, np.ndarray], view: View
 ) -> tuple[State, float]:
     """A state whose normals are those of the best one or of the start, whichever of one half of the lights agree better
     with those of the other, nearby, with blends between; and the part of the surface that is the start's.
 
-    work : of the kind of the best state. lights : as of `Judge.errors`.
+    work : of the kind of the best state. lights : as of `Judge.errors`. view : of the best state.
     """
     P = len(best.guess.normals)
-    view = work.view(best.guess, best.depth)
     pixels = np.sort(np.random.default_rng([work.judge.seed, 20]).choice(P, min(JUDGED, P), replace=False))
     both = np.empty((2, len(pixels)))
     for i in range(0, len(pixels), BLOCK):
