@@ -169,7 +169,7 @@ def judgement(result: Result) -> list[str]:
             "are taken to be all as far away, and the camera further."
         )
     if result.taken_back > 0:
-        sentences.append(f"On {100 * result.taken_back:.2g} % of the surface, the normals are those of the start.")
+        sentences.append(f"The start has a share of {100 * result.taken_back:.2g} % in the normals.")
     return sentences
 
 

@@ -140,8 +140,8 @@ class Result:
     so was kept; "judged", if something else predicts better; "not judged", with too few lights to leave any out, and
     the start was kept. left_out : how far predictions of "start" and "result" are off, in the mean value of each pixel.
     halves : of both, the mean angle between normals of one half of the lights and of the other, degrees. curl : of
-    both, that between normals and those of the depth that is integrated from them. taken_back : part of the surface
-    whose normals are those of the start.
+    both, that between normals and those of the depth that is integrated from them. taken_back : mean share of
+    the start in the normals.
     strength : by which factor interreflections were multiplied, for shadows to be as they are in the images; NaN if
     there are too few of these, and so they were left as they are.
     away : distance of the lights from the middle of the object, pixels of the full size, if the shading told it;
