@@ -94,6 +94,7 @@ def test_the_best_state_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
 
     states = []
     monkeypatch.setattr(alternation.Alternations, "score", score)
+    monkeypatch.setattr(taking_back, "of_the_whole", lambda *_: 0.0)  # no mean with the start
     monkeypatch.setattr(alternation.Alternations, "judged_start", lambda self, guess, *_: (alternation.State(
         guess, self.integrate(guess), self.kind, 4.0, start=True), None))  # fmt: skip
     options = ps.Options(**{**QUICK, "iterations": (4,), "tolerance": 0.0}, reflectance=False)
