@@ -40,6 +40,9 @@ from .vectors import LUMINANCE, directions_of, every
 
 log = logging.getLogger(__name__)
 
+#: Images whose mean is less than this part of the median one are taken to be without light.
+DIM = 0.1
+
 #: Said of sets that show nothing.
 ALL_BLACK = "ps: all images are black in the mask; check the images, their exposure and the mask"
 
@@ -115,6 +118,12 @@ class Dataset:
         pictured = self.values * self.intensities.astype(np.float32)
         found = (pictured >= (1 - 1e-4) * pictured.max()).any(2)
         return found if CLIPPED < found.mean() < 1 - CLIPPED else np.zeros_like(found)
+
+    @functools.cached_property
+    def lit(self) -> np.ndarray:
+        """Which images are not taken to be without light: (K,), bool."""
+        means = self.luminance.mean(0)
+        return means > DIM * np.median(means)
 
     @functools.cached_property
     def typical(self) -> float:

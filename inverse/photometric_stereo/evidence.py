@@ -18,7 +18,7 @@ import numpy as np
 from rimlight import ggx
 
 from . import least_squares
-from .dataset import Dataset, angles
+from .dataset import Dataset
 from .direct import DirectModel, Guess, own
 
 #: Part of the lights that are left out whole, and part of those of each block of pixels; its width, pixels.
@@ -94,6 +94,14 @@ def halves(lights: np.ndarray) -> list[np.ndarray]:
     x, y = (lights[:, :2] - np.median(lights[:, :2], axis=0)).T
     away = np.hypot(x, y)
     return [x > 0, y > 0, x * y > 0, away > np.median(away)]
+
+
+def mean_angle(apart: np.ndarray) -> np.ndarray:
+    """Of `Judge.apart`, (W, P, 3), over its ways that are known, degrees, (P,). NaN where none is."""
+    off = np.linalg.norm(apart, axis=2)
+    told = np.isfinite(off)
+    total = np.where(told, np.degrees(2 * np.arcsin(off / 2)), 0).sum(0)
+    return np.divide(total, told.sum(0), out=np.full(len(total), np.nan), where=told.any(0))
 
 
 @dataclass(frozen=True)
@@ -174,7 +182,21 @@ class Judge:
         pixels: np.ndarray | None = None,
     ) -> np.ndarray:
         """Angle between the normals that one half of the lights tells and those of the other, degrees, mean over some
-        ways to part the lights, of each of its pixels. NaN where halves do not tell normals.
+        ways to part the lights, of each of its pixels. NaN where halves do not tell normals. As of `apart`."""
+        return mean_angle(self.apart(guess, points, seen, indirect, lights=lights, pixels=pixels))
+
+    def apart(
+        self,
+        guess: Guess,
+        points: np.ndarray,
+        seen: np.ndarray,
+        indirect: np.ndarray | None,
+        *,
+        lights: tuple[np.ndarray, np.ndarray] | None = None,
+        pixels: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Differences between the normals that one half of the lights tells and those of the other, (W, P', 3), for W
+        ways to part the lights: at most as long as those of normals `FAR` apart. NaN where halves do not tell normals.
 
         pixels : others than its own. The rest is as of `errors`; the material is that of the guess.
         """
@@ -192,12 +214,16 @@ class Judge:
             model.fit_normals(turned, steps=STEPS)
             return turned.normals
 
-        total, number = np.zeros(len(pixels)), np.zeros(len(pixels))
-        for half in halves(model.mean_directions()):
-            told = np.minimum(*((counts[:, part] > 0).sum(1) for part in (half, ~half))) >= TELLING
-            total += told * np.minimum(angles(found(half), found(~half)), FAR)
-            number += told
-        return np.divide(total, number, out=np.full(len(pixels), np.nan), where=number > 0)
+        every, most = [], 2 * np.sin(np.radians(FAR) / 2)
+        lit = self.data.lit  # what is without light would spoil the half that it is in
+        for first in halves(model.mean_directions()[lit]):
+            half, other = np.zeros((2, len(lit)), bool)
+            half[lit], other[lit] = first, ~first
+            told = np.minimum(*((counts[:, part] > 0).sum(1) for part in (half, other))) >= TELLING
+            off = found(half) - found(other)
+            off *= np.minimum(1, most / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-12))
+            every.append(np.where(told[:, None], off, np.nan))
+        return np.array(every)
 
     def _few(self, pixels: np.ndarray) -> Dataset:
         """The data of some pixels, their numbers ascending."""

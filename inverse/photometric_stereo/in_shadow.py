@@ -14,9 +14,6 @@ from .dataset import LUMINANCE, Dataset
 #: Fewest values in shadow that tell anything, and the largest factor: shadows of a wrong shape may be lit.
 FEWEST, LARGEST = 10, 2.0
 
-#: Images whose mean is less than this part of the median one are taken to be without light.
-DIM = 0.1
-
 
 def strength(data: Dataset, indirect: np.ndarray, hidden: np.ndarray) -> float:
     """Factor by which interreflections, (P, K, 3), must be multiplied to be what is seen in shadow, least absolute
@@ -24,11 +21,9 @@ def strength(data: Dataset, indirect: np.ndarray, hidden: np.ndarray) -> float:
 
     hidden : (P, K), bool, which values are in shadow. Values that cannot be told from 0 are not used.
     """
-    means = data.luminance.mean(0)
-    lit = means > DIM * np.median(means)
-    shown, expected = data.luminance[:, lit], (indirect @ LUMINANCE)[:, lit]
+    shown, expected = data.luminance[:, data.lit], (indirect @ LUMINANCE)[:, data.lit]
     floor = shown[shown > 0].min(initial=np.inf)
-    told = hidden[:, lit] & (expected > floor)
+    told = hidden[:, data.lit] & (expected > floor)
     if told.sum() < FEWEST:
         return np.nan
     ratio, weight = shown[told] / expected[told], expected[told]

@@ -67,6 +67,11 @@ def as_orthographic(depth: np.ndarray, away: float) -> np.ndarray:
     return (depth.mean() - depth) * away
 
 
+def as_near(depth: np.ndarray, away: float) -> np.ndarray:
+    """The other way around."""
+    return CAMERA - depth / away
+
+
 def distance(work: Alternations, state: State) -> float:
     """Of the lights from the middle of the object, pixels, as the shading tells it; infinity if it does not.
 

@@ -107,7 +107,8 @@ def status(folder: Path) -> str | None:
 
 
 def write_pictures(folder: Path, result: Result) -> None:
-    """Write ``normals.png``, 16 bits, (n + 1) / 2; ``bsdf.png``; ``mesh.ply``, a vertex at the centre of each pixel.
+    """Write ``normals.png``, 16 bits, (n + 1) / 2; ``bsdf.png``; ``mesh.ply``, a vertex at the centre of each pixel;
+    ``uncertainty.exr``, if it is known: NaN outside the mask.
 
     Raises
     ------
@@ -117,6 +118,10 @@ def write_pictures(folder: Path, result: Result) -> None:
     encoded = np.round((data.image(result.guess.normals.astype(np.float32), -1) + 1) / 2 * 65535).astype(np.uint16)
     with replacing(folder / "normals.png") as temporary:
         mi.Bitmap(encoded).write(str(temporary), mi.Bitmap.FileFormat.PNG)
+    (folder / "uncertainty.exr").unlink(missing_ok=True)
+    if result.uncertainty is not None:
+        degrees = data.image(result.uncertainty.astype(np.float32), np.nan)[..., None]
+        write_exr(folder / "uncertainty.exr", {"": degrees}, {"unit": "degrees, standard error of the normals"})
     figure = bsdf_figure(result)
     FigureCanvasAgg(figure)
     with replacing(folder / "bsdf.png") as temporary:
@@ -164,7 +169,7 @@ def judgement(result: Result) -> list[str]:
             "are taken to be all as far away, and the camera further."
         )
     if result.taken_back > 0:
-        sentences.append(f"On {100 * result.taken_back:.2g} % of the surface, the normals are those of the start.")
+        sentences.append(f"The start has a share of {100 * result.taken_back:.2g} % in the normals.")
     return sentences
 
 

@@ -21,9 +21,10 @@ log = logging.getLogger(__name__)
 #: Pixels from which this is judged, at most and at least.
 PIXELS, FEWEST = 5000, 100
 
-#: Images whose mean is less than this part of the median one are taken to be without light.
-DIM = 0.1
 
+#: Said of an image whose light is wrong.
+_LEFT_OUT = "The image is left out of a reconstruction."
+_KEPT = "The image is kept in a reconstruction, for other images are not predicted better without it."
 
 #: Pictures are the same whose values differ at most by this part of the largest one: noise alone makes more. Their
 #: lights differ if they are more than so many degrees apart.
@@ -62,18 +63,18 @@ class Plausibility:
         wrong = [
             f"The light of {self.names[w.number]} seems to be listed in a wrong direction: another one, {w.off:.0f} "
             f"degrees away, explains all but {100 * w.least:.2g} % of its squared values, the listed one all but "
-            f"{100 * w.left:.2g} %. The image is left out of a reconstruction. Correct line {w.number + 1} of "
+            f"{100 * w.left:.2g} %. {_LEFT_OUT if w.harmful else _KEPT} Correct line {w.number + 1} of "
             f"{self.file}, or take the image out."
             for w in self.wrong
         ]
         return [*copies, *self.order.said(self.file), *wrong, *of_axes, *self.black_level.said()]
 
 
-def judged(data: Dataset) -> Plausibility:
-    """Of a data set. What it takes grows with its values: see `block`."""
+def judged(data: Dataset, method: str = "trimmed") -> Plausibility:
+    """Of a data set. What it takes grows with its values: see `block`. method : of the start, as of `Options.start`,
+    which says if lights in wrong directions do harm."""
     file = files.LEDS if data.near else files.DIRECTIONS
-    shown, means = ~unlit(data), data.luminance.mean(0)
-    lit = np.flatnonzero(means > DIM * np.median(means))
+    shown, lit = ~unlit(data), np.flatnonzero(data.lit)
     if shown.sum() < FEWEST or len(lit) < 3:
         return Plausibility(file)
     mask = data.mask.copy()
@@ -89,7 +90,7 @@ def judged(data: Dataset) -> Plausibility:
     names = data.names or [f"image {k + 1}" for k in range(len(lights))]
     order, wrong = lights_order.judged(values, lights, names, lit), []
     if np.isfinite(order.chance) and not order.wrong:
-        wrong = _wrong(values, lights, lit)
+        wrong = _wrong(values, lights, directions, lit, method)
         if order.swapped is not None and not wrong_lights.swapped(wrong, lights, order.swapped[:2]):
             order = replace(order, swapped=None)
     return Plausibility(
@@ -103,10 +104,16 @@ def judged(data: Dataset) -> Plausibility:
     )
 
 
-def _wrong(values: np.ndarray, lights: np.ndarray, lit: np.ndarray) -> list[Wrong]:
-    """Lights in wrong directions, numbered as of all images. As of `lights_order.judged`."""
+def _wrong(values: np.ndarray, lights: np.ndarray, directions: np.ndarray, lit: np.ndarray, method: str) -> list[Wrong]:
+    """Lights in wrong directions, numbered as of all images. As of `lights_order.judged`.
+
+    directions : of all lights, at each pixel if they are near. method : as of `judged`.
+    """
     found = wrong_lights.judged(lights_order.products(values[:, lit]), lights[lit])
-    return [replace(wrong, number=int(lit[wrong.number])) for wrong in found]
+    numbers = np.array([lit[wrong.number] for wrong in found], int)
+    of_wrong = numbers, np.setdiff1d(lit, numbers)
+    harmful = bool(found) and wrong_lights.harmful(values.astype(np.float64), directions, *of_wrong, method)
+    return [replace(w, number=int(k), harmful=harmful) for w, k in zip(found, numbers, strict=True)]
 
 
 def _copies(
@@ -123,14 +130,16 @@ def _copies(
     return tuple(found.values())
 
 
-def checked(data: Dataset) -> Dataset:
-    """A data set of any size without the images whose lights are wrong, and with its doubts, which are logged."""
+def checked(data: Dataset, method: str = "trimmed") -> Dataset:
+    """A data set of any size without the images whose lights are wrong and do harm, and with its doubts, which are
+    logged. method : as of `judged`."""
     step = block(len(data.values))
-    found = judged(data.at(1 / step)) if data.blocks(step)[0].any() else Plausibility()
+    found = judged(data.at(1 / step), method) if data.blocks(step)[0].any() else Plausibility()
     for text in (said := found.said()):
         log.warning("ps: %s", text)
     data = replace(data, doubts=(*data.doubts, *said))
-    return data.without([wrong.number for wrong in found.wrong]) if found.wrong else data
+    harmful = [wrong.number for wrong in found.wrong if wrong.harmful]
+    return data.without(harmful) if harmful else data
 
 
 def block(pixels: int) -> int:

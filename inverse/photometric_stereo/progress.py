@@ -45,7 +45,7 @@ class Progress:
     best : of the trials that ended. course : of this trial.
     away : distance of the lights, pixels of the full size, infinity if they are distant; None until it is known.
     distant, distant_start : while near lights are tried, the best state and the start with distant ones.
-    back : part of the surface that was taken back to the start at the end.
+    back : share of the start in the normals at the end.
     history, seconds : as of `Result`.
     """
 

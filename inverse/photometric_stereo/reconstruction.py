@@ -22,7 +22,7 @@ from tqdm import tqdm
 from rimlight import ggx
 from rimlight.edge_sampling.refusals import InputError
 
-from . import least_squares, nearness, plausibility, start, taking_back
+from . import least_squares, nearness, plausibility, start, taking_back, uncertainty
 from .alternation import Alternations, Course, State, View
 from .dataset import Dataset
 from .direct import Guess
@@ -140,12 +140,13 @@ class Result:
     so was kept; "judged", if something else predicts better; "not judged", with too few lights to leave any out, and
     the start was kept. left_out : how far predictions of "start" and "result" are off, in the mean value of each pixel.
     halves : of both, the mean angle between normals of one half of the lights and of the other, degrees. curl : of
-    both, that between normals and those of the depth that is integrated from them. taken_back : part of the surface
-    whose normals are those of the start.
+    both, that between normals and those of the depth that is integrated from them. taken_back : mean share of
+    the start in the normals.
     strength : by which factor interreflections were multiplied, for shadows to be as they are in the images; NaN if
     there are too few of these, and so they were left as they are.
     away : distance of the lights from the middle of the object, pixels of the full size, if the shading told it;
-    infinity if it did not.
+    infinity if it did not. uncertainty : standard errors of the normals before descent, (P,), degrees, see
+    `uncertainty.of_normals`; None before the end, and if the start is returned.
     doubts : what is probably wrong with the data, in sentences. history : for each alternation, the size of the images,
     seconds since the start, the root mean square residual over the median value, and where the truth is known the mean
     angular error, degrees."""
@@ -165,6 +166,7 @@ class Result:
     taken_back: float = 0.0
     strength: float = np.nan
     away: float = np.inf
+    uncertainty: np.ndarray | None = None
     doubts: tuple[str, ...] = ()
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -226,7 +228,7 @@ class Reconstruction:
         if not mi.is_rgb or mi.is_polarized:
             raise InputError(f"ps: a variant of three colours is needed, such as llvm_ad_rgb, got {mi.variant()}")
         start.check(data)
-        self.data, self.options, self.after = plausibility.checked(data), options, after
+        self.data, self.options, self.after = plausibility.checked(data, options.start), options, after
         self.lobes = ggx.read_dictionary()[0] if options.reflectance else ggx.Lobes((np.nan,), (np.nan,))
         self.kinds = options.kinds()
         self.rng = np.random.default_rng(options.seed)
@@ -234,6 +236,7 @@ class Reconstruction:
         self.now = Progress(kind=self.kinds[0])
         self.file: Checkpoint | None = None
         self.work: Alternations | None = None
+        self.uncertainty: np.ndarray | None = None
 
     def keep(self, path: Path, *, resume: bool) -> None:
         """Write checkpoints from now on. resume : go on from the one that is there."""
@@ -340,8 +343,9 @@ class Reconstruction:
         if best.start or not self.work.judge.able:
             return
         self._work_on(best)
-        lights = start.flat(self.work.data).lighting()
-        now.best, now.back = taking_back.taken_back(self.work, best, now.start, lights)
+        lights, view = start.flat(self.work.data).lighting(), self.work.view(best.guess, best.depth)
+        now.best, now.back = taking_back.taken_back(self.work, best, now.start, lights, view)
+        self.uncertainty = uncertainty.of_normals(self.work, now.best, view)
 
     def _begin(self, most: int, coarse: Result | None) -> View | None:
         """Judge the start of a size, and begin its alternations. Returns the view of their first state, if known."""
@@ -398,6 +402,7 @@ class Reconstruction:
             taken_back=1.0 if best.start else now.back,
             strength=best.strength,
             away=away,
+            uncertainty=self.uncertainty,
             doubts=self.data.doubts,
             history=now.history,
             seconds=now.seconds,

@@ -20,7 +20,7 @@ from rimlight.inverse import page
 from rimlight.inverse.page import number
 from rimlight.sys_info import processor
 
-from . import output
+from . import nearness, output
 from .dataset import Dataset
 from .direct import Guess
 from .integration import normals_of
@@ -183,19 +183,24 @@ def _rendered(view: View, result: Result, options: Options) -> list[str]:
     around = np.radians(np.arange(LIGHTS) * 360 / LIGHTS)
     sin, cos = np.sin(np.radians(ELEVATION)), np.cos(np.radians(ELEVATION))
     lights = np.stack([sin * np.cos(around), sin * np.sin(around), np.full(LIGHTS, cos)], 1)
-    render = lambda data, guess: _render(view, result, options, data, guess)
-    relit = render(
-        _with_lights(view.data, np.zeros((len(view.data.values), LIGHTS, 3), np.float32), lights),
-        dataclasses.replace(view.guess, exposures=np.ones(LIGHTS)),
-    )
-    again = render(view.data, view.guess)
-    return [_relighting(view, relit), _photographs(view, result, again)]
+    relit = _with_lights(view.data, np.zeros((len(view.data.values), LIGHTS, 3), np.float32), lights)
+    guess = dataclasses.replace(view.guess, exposures=np.ones(LIGHTS))
+    images = _render(result, options, relit, guess, view.depth)
+    return [_relighting(view, images), _photographs(view, result, rendered_again(view, result, options))]
 
 
-def _render(view: View, result: Result, options: Options, data: Dataset, guess: Guess) -> np.ndarray:
+def rendered_again(view: View, result: Result, options: Options) -> np.ndarray:
+    """What the photographs show, under their lights, near ones if the shading told so: (P, K, 3)."""
+    data, depth, away = view.data, view.depth, result.away / view.step
+    if np.isfinite(away):
+        data, depth = nearness.around(data, away), nearness.as_near(depth, away)
+    return _render(result, options, data, view.guess, depth)
+
+
+def _render(result: Result, options: Options, data: Dataset, guess: Guess, depth: np.ndarray) -> np.ndarray:
     several = guess.base is not None
     rendering = Rendering(data, result.lobes, max_depth=options.max_depth, several=several, base_eta=guess.base_eta)
-    rendering.update(guess, view.depth[rendering.domain.nearest])
+    rendering.update(guess, depth[rendering.domain.nearest])
     return rendering.image(spp=SPP, seed=options.seed)
 
 

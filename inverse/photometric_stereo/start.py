@@ -40,8 +40,10 @@ def clipped(data: Dataset, size: float) -> np.ndarray:
 
 
 def counts(data: Dataset, level: Dataset, size: float, dark: float) -> np.ndarray:
-    """How much values of a level count, (P, K): 0 for the darkest of each pixel, and what is clipped, even in part."""
-    return (least_squares.brightest(level.luminance, dark) & ~clipped(data, size)).astype(np.float32)
+    """How much values of a level count, (P, K): 0 for the darkest of each pixel, for what is clipped, even in part, and
+    for images without light."""
+    bright = least_squares.brightest(level.luminance, dark)
+    return (bright & ~clipped(data, size) & level.lit).astype(np.float32)
 
 
 def method(data: Dataset, level: Dataset, size: float, options: Options) -> tuple[str, np.ndarray | None]:
@@ -81,8 +83,13 @@ def method(data: Dataset, level: Dataset, size: float, options: Options) -> tupl
     names = dict.fromkeys((options.start, "least squares"))
     gains = {(name, k): first - off(name, used) for name in names for k, used in enumerate(usable)}
     (name, k), gain = max(gains.items(), key=lambda item: item[1].sum())
-    error = np.sqrt(sum(total.size * total.var() for total in (gain.sum(0), gain.sum(1))))
-    return (name, usable[k]) if gain.sum() > error else given
+    return (name, usable[k]) if sure(gain) else given
+
+
+def sure(gain: np.ndarray) -> bool:
+    """Is the sum of what deviations are less by, (P, K), more than its standard error: of the pixels, and of the
+    lights?"""
+    return bool(gain.sum() > np.sqrt(sum(total.size * total.var() for total in (gain.sum(0), gain.sum(1)))))
 
 
 def check(data: Dataset) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import least_squares
+from . import least_squares, start
 from .dataset import angles
 from .vectors import unit
 
@@ -30,6 +30,9 @@ LEAST = 5.0
 #: largest.
 SHALLOW = 0.03
 
+#: Part of the values of a pixel, the darkest ones, by which it is not judged whether a light does harm.
+DARK = 0.2
+
 #: Of the images, at most this part is taken for wrong: of more, it would not be known which ones are right.
 MOST = 0.2
 
@@ -38,13 +41,14 @@ MOST = 0.2
 class Wrong:
     """A light. number : of its image. shown : direction that the image shows. off : angle between this and the given
     direction, degrees. left, least : parts of the squared values of the image that the given one and the shown one
-    leave unexplained."""
+    leave unexplained. harmful : are other images predicted better without it?"""
 
     number: int
     shown: tuple[float, float, float]
     off: float
     left: float
     least: float
+    harmful: bool = True
 
 
 def judged(products: np.ndarray, lights: np.ndarray) -> list[Wrong]:
@@ -90,3 +94,23 @@ def swapped(wrong: list[Wrong], lights: np.ndarray, pair: tuple[int, int]) -> bo
     both = [light for light in wrong if light.number in others]
     shows_other = [angles(np.array(w.shown), lights[others[w.number]]) < w.off / FARTHER for w in both]
     return len(both) < 2 or all(shows_other)
+
+
+def harmful(values: np.ndarray, directions: np.ndarray, wrong: np.ndarray, others: np.ndarray, method: str) -> bool:
+    """Are images of other lights, of which a fifth is left out at a time, predicted better from the rest of them than
+    from these and the wrong lights, by more than the standard error? Of metal, which no start explains, they may not
+    be. wrong, others : numbers of lights. method : one of `least_squares.METHODS`."""
+    bright = least_squares.brightest(values[:, others], DARK)
+    mean = np.maximum(values.mean(1, keepdims=True), 1e-30)
+
+    def off(added: np.ndarray) -> np.ndarray:
+        each = np.zeros(bright.shape)
+        for part in range(start.PARTS):
+            out = np.arange(len(others)) % start.PARTS == part
+            kept = np.append(others[~out], added)
+            b = least_squares.METHODS[method](values[:, kept], directions[..., kept, :])
+            predicted = np.maximum(least_squares.predicted(b, directions[..., others[out], :]), 0)
+            each[:, out] = np.minimum(np.abs(predicted - values[:, others[out]]) / mean, start.MOST)
+        return bright * each
+
+    return start.sure(off(wrong) - off(np.array([], int)))

@@ -94,6 +94,7 @@ def test_the_best_state_is_kept(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
 
     states = []
     monkeypatch.setattr(alternation.Alternations, "score", score)
+    monkeypatch.setattr(taking_back, "of_the_whole", lambda *_: 0.0)  # no mean with the start
     monkeypatch.setattr(alternation.Alternations, "judged_start", lambda self, guess, *_: (alternation.State(
         guess, self.integrate(guess), self.kind, 4.0, start=True), None))  # fmt: skip
     options = ps.Options(**{**QUICK, "iterations": (4,), "tolerance": 0.0}, reflectance=False)
@@ -121,6 +122,30 @@ def test_normals_of_halves_tell_a_wrong_model(matte: Dataset) -> None:
     assert np.nanmean(judge.disagreement(guess, view.points, view.seen, None)) > 2 * np.nanmean(right)
     shown = np.zeros_like(view.seen)
     assert np.isnan(judge.disagreement(guess, view.points, shown, None)).all()
+
+
+def test_images_without_light_spoil_no_half(matte: Dataset) -> None:
+    """Halves are those of the lights that shone, also of the start: it trims its values, which is robust against few
+    that are black."""
+    lobes, options, off = ggx.read_dictionary()[0], ps.Options(**QUICK), [1, 4]
+    values = matte.values.copy()
+    values[:, off] *= np.float32(0.01)
+    found = []
+    for data in (dataclasses.replace(matte, values=values), matte.without(off)):
+        counts = start.counts(data, data, 1.0, 0.0)
+        guess, plane = start.guess(data, lobes, counts, options), start.flat(data)
+        seen = np.ones(counts.shape, bool)
+        judge = Judge(data, lobes, left_out(data, 0), counts, 0, "trimmed")
+        guess.exposures = np.ones(len(data.lights))
+        points = np.array(plane.points).reshape(-1, 3)
+        found.append(judge.disagreement(guess, points, seen, None, lights=plane.lighting()))
+    assert list(np.flatnonzero(~counts_of(matte, values).any(0))) == off
+    np.testing.assert_allclose(*found, atol=1e-4)
+
+
+def counts_of(data: Dataset, values: np.ndarray) -> np.ndarray:
+    changed = dataclasses.replace(data, values=values)
+    return start.counts(changed, changed, 1.0, 0.0)
 
 
 @pytest.mark.parametrize("spp", [8, 2000])
@@ -151,12 +176,14 @@ def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     states = []
     left = np.nonzero(matte.mask)[1] < N / 2
 
-    def disagreement(self, guess, points, seen, indirect, *, lights=None, pixels=None):
+    def apart(self, guess, points, seen, indirect, *, lights=None, pixels=None):
         pixels = self.pixels() if pixels is None else pixels
-        return np.full(len(pixels), 2.0) if lights is not None else np.where(left[pixels], 20.0, 0.1)
+        off = np.full(len(pixels), 0.04) if lights is not None else np.where(left[pixels], 0.1, 0.002)
+        return np.stack([off, 0 * off, 0 * off], 1)[None]
 
     monkeypatch.setattr(taking_back, "WIDTH", 1.0)
-    monkeypatch.setattr(Judge, "disagreement", disagreement)
+    monkeypatch.setattr(Judge, "apart", apart)
+    monkeypatch.setattr(taking_back, "of_the_whole", lambda *_: 0.0)
     monkeypatch.setattr(alternation.State, "beats", lambda self, start: True)
     monkeypatch.setattr(alternation.State, "better_than", lambda self, other: True)
     options = ps.Options(**QUICK, reflectance=False)
@@ -166,7 +193,32 @@ def test_regions_are_taken_back(matte: Dataset, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(found.guess.normals[far[0]], found.start[far[0]], atol=0.01)
     assert min(np.abs(found.guess.normals[far[1]] - n[far[1]]).max() for n in states) < 1e-6
     assert found.taken_back == pytest.approx(0.5, abs=0.1)
-    assert "of the surface, the normals are those of the start" in output.judgement(found)[-1]
+    assert "The start has a share of" in output.judgement(found)[-1]
+
+
+def test_means_of_start_and_result_have_the_least_error(matte: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of normals with errors that are known: half of those of the result are those of the start, too."""
+    rng, lobes = np.random.default_rng(0), ggx.read_dictionary()[0]
+    options, counts = ps.Options(**QUICK, reflectance=False), np.ones(matte.values.shape[:2], np.float32)
+    judge = Judge(matte, lobes, left_out(matte, 0), counts, 0, "trimmed")
+    work = alternation.Alternations(matte, lobes, Kind(), judge, options, np.random.default_rng(0))
+    guess = start.guess(matte, lobes, counts, options)
+    errors = 0.1 * rng.standard_normal((3, 9, len(counts), 3))  # of eight halves, and of all lights
+    of_both = {"start": errors[0] + errors[1], "result": errors[0] + 0.5 * errors[2]}
+
+    def apart(self, guess, points, seen, indirect, *, lights=None, pixels=None):
+        e = of_both["result" if lights is None else "start"][:, self.pixels() if pixels is None else pixels]
+        return e[:4] - e[4:8]
+
+    monkeypatch.setattr(Judge, "apart", apart)
+    normals = {name: unit(matte.truth + e[8]) for name, e in of_both.items()}
+    depth = work.integrate(guess)
+    first, best = (alternation.State(dataclasses.replace(guess, normals=n), depth, Kind()) for n in normals.values())
+    lights = start.flat(matte).lighting()
+    found, share = taking_back.taken_back(work, best, first, lights, work.view(guess, best.depth))
+    assert share == pytest.approx(0.25 / 1.25, abs=0.02)
+    square = lambda n: np.square(np.radians(angles(n, matte.truth))).mean()
+    assert square(found.guess.normals) < 0.98 * min(square(n) for n in normals.values())
 
 
 def test_a_result_must_win_in_all() -> None:

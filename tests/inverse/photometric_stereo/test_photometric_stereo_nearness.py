@@ -11,7 +11,7 @@ import pytest
 from rimlight import ggx
 from rimlight.inverse import checkpoint
 from rimlight.inverse import photometric_stereo as ps
-from rimlight.inverse.photometric_stereo import nearness, progress, reconstruction, simulation
+from rimlight.inverse.photometric_stereo import nearness, progress, reconstruction, report, simulation
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import DirectModel, Guess
 from rimlight.inverse.photometric_stereo.rendering import Domain
@@ -52,6 +52,10 @@ def test_near_lights_are_told(lit_from_near: Dataset) -> None:
     assert found.data.camera is None and not found.data.near
     off = angles(found.domain.normals(found.depth), found.guess.normals).mean()
     assert off == pytest.approx(found.curl["result"], rel=0.1)
+    # The report renders near lights
+    view, options = report.View.of(found), ps.Options(**QUICK)
+    off = lambda of: np.abs(report.rendered_again(view, of, options) - view.data.values).mean()
+    assert off(found) < 0.75 * off(dataclasses.replace(found, away=np.inf))
 
 
 def test_distant_lights_stay_distant() -> None:

@@ -355,3 +355,13 @@ def test_curl_of_a_surface_is_zero() -> None:
         data = simulated(shape="folds", size=48, focal=focal, lights=8, spp=1, noise=0.0)
         curls = axes.judged(data, data.truth).curls
         assert all(curls[kind] > 8 * curls["as given"] for kind in curls if kind != "as given"), curls
+
+
+@pytest.mark.parametrize(("seed", "harmful"), [(7104, False), (1018, False), (1012, True), (6028, True)])
+def test_wrong_lights_that_do_no_harm_are_kept(seed: int, harmful: bool) -> None:
+    """Silver paint and chrome, of which no diffuse start predicts anything, and a light that is off by 9 degrees. Of a
+    mould and of folds, other images are predicted much better without those of the wrong lights."""
+    data, options, _ = random_photometric.make(seed)
+    (said, *_), kept = plausibility.judged(data, options.start).said(), plausibility.checked(data, options.start)
+    assert ("is left out" in said) is harmful and ("is kept" in said) is not harmful
+    assert (len(kept.lights) < len(data.lights)) is harmful
