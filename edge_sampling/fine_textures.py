@@ -20,7 +20,7 @@ STEP = 2**-6
 
 #: How much faster the light of a fine texture changes there than over a pixel; and if it jumps along lines that are
 #: edges on the film.
-RATIO, RATIO_OF_LINES = 4.0, 16.0
+RATIO, RATIO_OF_LINES = 4.0, 12.0
 
 
 def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any], as_edges: Sequence[Any]) -> list[Any]:
