@@ -296,9 +296,11 @@ class BoundarySearch:
         return [s for s in held.shapes if s not in sliding] if held is not None and not has_veils(scene) else []
 
     def _textures_on_film(self, moving: Moving, at_rest: list[mi.Shape]) -> list[int]:
-        """Of which meshes the camera sees the lines of textures as edges, besides those `at_rest`."""
+        """Of which meshes the camera sees the lines of textures as edges, besides those `at_rest`. Not of mirrors: rays
+        part there, and would be found to part once more where they end."""
         found = self._textures.on_film([*moving.sliding, *at_rest]) if self.from_points else []
-        return [i for i in found if moving.camera or moving.flags[i]]
+        seen = [i for i in found if moving.camera or moving.flags[i]]
+        return [i for i in seen if not is_mirror(inner(self.geometry.meshes[i]))]
 
     def _with_textures(self, moving: Moving, edges: Edges, at_rest: list[mi.Shape]) -> tuple[Geometry, Edges]:
         """The shapes with these lines, and all edges. edges : the others."""
