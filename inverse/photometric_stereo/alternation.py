@@ -15,7 +15,7 @@ from rimlight import ggx
 from . import calibration, in_shadow
 from .dataset import LUMINANCE, Dataset, angles
 from .direct import DirectModel, Guess, Lighting
-from .evidence import FAR, Judge, Kind
+from .evidence import FAR, Judge, Kind, mean_angle
 from .rendering import Rendering
 
 #: Paths of each image of interreflections, at least: small images have more samples per pixel than `spp`, and are
@@ -191,7 +191,7 @@ class Alternations:
         if self.judge.able:
             of_view = view.points, view.seen, view.indirect
             state.left_out = float(self.judge.errors(state.guess, self.kind, *of_view).mean())
-            state.halves = _mean(self.judge.disagreement(state.guess, *of_view))
+            state.halves = _mean(mean_angle(self.judge.apart(state.guess, *of_view)))
             state.curl = self._curl(state)
 
     def _curl(self, state: State) -> float:
@@ -286,7 +286,7 @@ class Alternations:
                 for kind in kinds
                 for indirect in ([None] if view.indirect is None else [None, view.indirect])
             )
-            state.halves = _mean(self.judge.disagreement(guess, *of_view, lights=lights))
+            state.halves = _mean(mean_angle(self.judge.apart(guess, *of_view, lights=lights)))
             state.curl = self._curl(state)
         return state, view
 

@@ -171,20 +171,6 @@ class Judge:
         w = left * counts
         return (w * deviation).sum(1) / np.maximum(w.sum(1), 1e-9)
 
-    def disagreement(
-        self,
-        guess: Guess,
-        points: np.ndarray,
-        seen: np.ndarray,
-        indirect: np.ndarray | None,
-        *,
-        lights: tuple[np.ndarray, np.ndarray] | None = None,
-        pixels: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Angle between the normals that one half of the lights tells and those of the other, degrees, mean over some
-        ways to part the lights, of each of its pixels. NaN where halves do not tell normals. As of `apart`."""
-        return mean_angle(self.apart(guess, points, seen, indirect, lights=lights, pixels=pixels))
-
     def apart(
         self,
         guess: Guess,

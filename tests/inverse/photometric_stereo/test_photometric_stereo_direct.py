@@ -14,7 +14,7 @@ from rimlight.inverse.photometric_stereo import reconstruction
 from rimlight.inverse.photometric_stereo.alternation import Alternations, State
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import HUBER, DirectModel, Guess, simplex_least_squares
-from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out
+from rimlight.inverse.photometric_stereo.evidence import Judge, Kind, left_out, mean_angle
 from rimlight.inverse.photometric_stereo.rendering import Rendering
 from rimlight.inverse.photometric_stereo.simulation import spiral
 from rimlight.inverse.photometric_stereo.vectors import unit
@@ -203,7 +203,7 @@ def test_coat_needs_evidence(plastic: Scene, coat: bool) -> None:
             model.fit_bsdf(guess, rng, coat=kind.coat)
             model.fit_normals(guess)
         judge, seen = judge_of(data, lobes), seen_by_all(data)
-        errors, halves = judge.errors(guess, kind, *seen), np.nanmean(judge.disagreement(guess, *seen))
+        errors, halves = judge.errors(guess, kind, *seen), np.nanmean(mean_angle(judge.apart(guess, *seen)))
         states.append(State(guess, plastic.depth, kind, errors.mean(), halves))
     plain, with_coat = states
     assert with_coat.needed_beside(plain) == coat

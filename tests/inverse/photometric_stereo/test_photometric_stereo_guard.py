@@ -33,7 +33,7 @@ from rimlight.inverse.photometric_stereo import (
 )
 from rimlight.inverse.photometric_stereo.dataset import Dataset, angles
 from rimlight.inverse.photometric_stereo.direct import Guess
-from rimlight.inverse.photometric_stereo.evidence import FAR, Judge, Kind, left_out
+from rimlight.inverse.photometric_stereo.evidence import FAR, Judge, Kind, left_out, mean_angle
 from rimlight.inverse.photometric_stereo.rendering import Rendering, unlit
 from rimlight.inverse.photometric_stereo.vectors import unit
 
@@ -116,12 +116,12 @@ def test_normals_of_halves_tell_a_wrong_model(matte: Dataset) -> None:
     guess.weights = glossy(lobes)
     guess.weights[~np.isnan(lobes.eta)] = 0
     view = work.view(guess, work.integrate(guess))
-    right = judge.disagreement(guess, view.points, view.seen, None)
+    right = mean_angle(judge.apart(guess, view.points, view.seen, None))
     assert np.nanmean(right) < 1
     guess.weights = glossy(lobes)
-    assert np.nanmean(judge.disagreement(guess, view.points, view.seen, None)) > 2 * np.nanmean(right)
+    assert np.nanmean(mean_angle(judge.apart(guess, view.points, view.seen, None))) > 2 * np.nanmean(right)
     shown = np.zeros_like(view.seen)
-    assert np.isnan(judge.disagreement(guess, view.points, shown, None)).all()
+    assert np.isnan(mean_angle(judge.apart(guess, view.points, shown, None))).all()
 
 
 def test_images_without_light_spoil_no_half(matte: Dataset) -> None:
@@ -138,7 +138,7 @@ def test_images_without_light_spoil_no_half(matte: Dataset) -> None:
         judge = Judge(data, lobes, left_out(data, 0), counts, 0, "trimmed")
         guess.exposures = np.ones(len(data.lights))
         points = np.array(plane.points).reshape(-1, 3)
-        found.append(judge.disagreement(guess, points, seen, None, lights=plane.lighting()))
+        found.append(mean_angle(judge.apart(guess, points, seen, None, lights=plane.lighting())))
     assert list(np.flatnonzero(~counts_of(matte, values).any(0))) == off
     np.testing.assert_allclose(*found, atol=1e-4)
 
