@@ -10,7 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .geometry.meshes import inner, objects_below
+from .geometry.meshes import NO_ATTRIBUTES, inner, objects_below
+from .geometry.parameters import Parameter
 
 #: Rays by which textures are looked at.
 RAYS = 2**14
@@ -18,9 +19,44 @@ RAYS = 2**14
 #: Distance on the film of two positions close to each other, pixels.
 STEP = 2**-6
 
+#: Changes up to so many units in the last place are rounding: of a texture that is even, nothing else changes.
+ROUNDING = 64
+
 #: How much faster the light of a fine texture changes there than over a pixel; and if it jumps along lines that are
 #: edges on the film.
 RATIO, RATIO_OF_LINES = 4.0, 12.0
+
+
+class Looks:
+    """Counts how often textures are to be looked at: when their values are replaced for the first time, the second, the
+    fourth, the eighth time. So a texture that is even at the start of a fit can come to be fine, and a look, which
+    takes as long as a small step of a fit, is seldom."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._replaced = 0
+        #: With the arrays, so that their numbers are not given to others.
+        self._values: dict[str, Any] = {}
+
+    def at(self, found: Sequence[Parameter]) -> None:
+        """Look at the values of textures among all parameters. Reads nothing from the device."""
+        before, self._values = self._values, {p.name: _array(p.value) for p in found if _is_of_texture(p)}
+        if any(v.index != before[name].index for name, v in self._values.items() if name in before):
+            self._replaced += 1
+            self.count += self._replaced & (self._replaced - 1) == 0
+
+
+def _is_of_texture(p: Parameter) -> bool:
+    """Is a parameter an array of texels, or of values at vertices or faces?"""
+    if isinstance(p.node, mi.Texture):
+        return bool(dr.is_tensor_v(p.value))
+    last = p.name.rsplit(".", 1)[-1]
+    return isinstance(p.node, mi.Mesh) and last.startswith(("vertex_", "face_")) and last not in NO_ATTRIBUTES
+
+
+def _array(value: Any) -> Any:
+    value = dr.detach(value)
+    return value.array if dr.is_tensor_v(value) else value
 
 
 def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any], as_edges: Sequence[Any]) -> list[Any]:
@@ -79,7 +115,8 @@ def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.
             own = si.emitter(scene) == mi.EmitterPtr(emitter)
             seen += dr.select(own, mi.unpolarized_spectrum(emitter.eval(si, own)), 0)
         values.append(dr.mean(seen))
-    near, far = dr.abs(values[1] - values[0]) / STEP, dr.abs(values[2] - values[0])
+    near, far = (dr.abs(v - values[0]) for v in values[1:])
+    near = dr.select(near > ROUNDING * dr.epsilon(mi.Float) * dr.abs(values[0]), near, 0) / STEP
     shape = dr.reinterpret_array(mi.UInt32, si.shape)
     usable = si.is_valid() & dr.isfinite(near) & dr.isfinite(far)
     return dr.select(usable, near, 0), dr.select(usable, far, 0), dr.select(usable, shape, 0)

@@ -24,6 +24,9 @@ BENT = 1e-3
 #: A method of the meshes of Mitsuba 3.9, which those of 3.10 do not have.
 OLD = "vertex_positions_buffer"
 
+#: Parameters of meshes that are named like attributes.
+NO_ATTRIBUTES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -255,8 +258,7 @@ def make_mesh(
 
 def attribute_names(mesh: Any, of: str = "vertex_") -> list[str]:
     """Names of the attributes of the vertices, or ``face_`` of the faces."""
-    known = ("vertex_positions", "vertex_normals", "vertex_texcoords")
-    return [name for name in mi.traverse(inner(mesh)).properties if name.startswith(of) and name not in known]
+    return [name for name in mi.traverse(inner(mesh)).properties if name.startswith(of) and name not in NO_ATTRIBUTES]
 
 
 def _of_vertices(values: mi.TensorXf, index: mi.UInt32) -> mi.Float:

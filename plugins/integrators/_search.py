@@ -39,7 +39,7 @@ from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
-from rimlight.edge_sampling.fine_textures import fine_textures
+from rimlight.edge_sampling.fine_textures import Looks, fine_textures
 from rimlight.edge_sampling.first_points import HeldShapes, can_hold, has_points
 from rimlight.edge_sampling.geometry.grids import Grids
 from rimlight.edge_sampling.geometry.instances import Instances, is_flat
@@ -102,7 +102,9 @@ class BoundarySearch:
         self._bent: list[tuple[mi.Shape, mi.BSDF]] = []
         self._beyond: dict[tuple, tuple[mi.Sensor, list[str]]] = {}
         self._boundaries: dict[tuple, Boundaries] = {}
-        self._fine: dict[tuple, HeldShapes | None] = {}
+        #: What is held, and at which look at the textures that was found.
+        self._fine: dict[tuple, tuple[int, HeldShapes | None]] = {}
+        self._looks = Looks()
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor, sppi: int) -> Boundaries:
         """Find them for a frozen function, which is to be called next, and cannot look for itself."""
@@ -128,13 +130,15 @@ class BoundarySearch:
             return Boundaries(limits=limits)
         if not dr.flag(dr.JitFlag.FreezingScope):
             self._find_lines(scene)
+            self._looks.at(found)
         if not self._checked:
             # A frozen function cannot look at arrays: its `state_fn` must have done so, just before.
             self._refuse_while_recording()
-        key = (*moving.key, sppi > 0, self.depths, self._may_hold(sensor))
+        held = self._held(scene, sensor, moving)
+        key = (*moving.key, sppi > 0, self.depths, held)
         if key not in self._boundaries:
             self._refuse_while_recording()
-            self._boundaries[key] = self._find(scene, sensor, moving, sppi)
+            self._boundaries[key] = self._find(scene, sensor, moving, sppi, held)
         boundaries = self._boundaries[key]
         if boundaries.shading is not None and not dr.flag(dr.JitFlag.FreezingScope):
             boundaries.shading.boxes.find_shapes()
@@ -160,6 +164,7 @@ class BoundarySearch:
         self.geometry = self.edges = self._curves = self._rims = self._lines = self._textures = None
         self._sources = self._partial = self._media = None
         self._boundaries, self._fine, self._beyond, self._maps, self._bent = {}, {}, {}, [], []
+        self._looks = Looks()
         collect_before()
         self.geometry = geometry
         self.edges, weld = find_welded_edges(geometry)
@@ -255,9 +260,11 @@ class BoundarySearch:
                 "them a thickness."
             )
 
-    def _find(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving, sppi: int) -> Boundaries:
+    def _find(
+        self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving, sppi: int, held: HeldShapes | None
+    ) -> Boundaries:
         self._refuse_instances(moving)
-        lights, held = Lights(scene), self._held(scene, sensor, moving)
+        lights = Lights(scene)
         # What is held and moves behind edges that stand still comes out from behind them.
         on_film = np.array([m or moving.camera or held is not None for m in moving.flags], bool)
         sized = any(not e.flags() & mi.EmitterFlags.Delta for e in scene.emitters())
@@ -315,12 +322,13 @@ class BoundarySearch:
         return self.holds and can_hold(sensor) and not self.geometry.others
 
     def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
-        """The shapes whose points are held where the camera sees them, since they have fine textures. Found once, as
-        the first sensor sees them, for lines in which shapes cut each other may change with every step."""
+        """The shapes whose points are held where the camera sees them, since they have fine textures. Found as the
+        sensor of that moment sees them, and again when their textures have changed: see `Looks`."""
         if not self._may_hold(sensor):
             return None
         key = moving.camera, moving.flags
-        if key not in self._fine:
+        count, held = self._fine.get(key, (-1, None))
+        if count != self._looks.count and not dr.flag(dr.JitFlag.FreezingScope):
             shapes = surfaces(scene) if moving.camera else dict.fromkeys(inner(s) for s in moving.shapes)
             rough = [
                 s
@@ -329,8 +337,10 @@ class BoundarySearch:
             ]
             as_edges = [inner(self.geometry.meshes[i]) for i in self._textures_on_film(moving, [])]
             fine = fine_textures(scene, sensor, rough, as_edges)
-            self._fine[key] = HeldShapes(scene, fine) if fine else None
-        return self._fine[key]
+            if fine != (held.shapes if held is not None else []):
+                held = HeldShapes(scene, fine) if fine else None
+            self._fine[key] = self._looks.count, held
+        return held
 
     def _chains(
         self, scene: mi.Scene, moving: Moving, sppi: int, at_rest: list[mi.Shape]

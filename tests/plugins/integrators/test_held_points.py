@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from both_modes import assert_backward_is_forward
 from cases import CAMERA_X, case, diffuse
-from fine_textures import bitmap, fine, stage
+from fine_textures import TEXELS, bitmap, fine, stage
+from frozen import Step, assert_same, losses_and_gradients, numbers, one_thread
 from instances import stretched_ball
 
 import rimlight
 from rimlight.checks import FiniteDifferences, Motion, compare, derivative_image
+from rimlight.edge_sampling.fine_textures import Looks
+from rimlight.edge_sampling.geometry.parameters import parameters
 
 
 def held(scene, integrator, key="sensor.to_world"):
@@ -81,6 +84,47 @@ def test_derivatives_are_the_same_if_nothing_is_held(variant, monkeypatch, kind)
         integrator = mi.load_dict({"type": "direct_edge"})
         made.append(np.array([derivative_image(scene, integrator, motion, spp=64, seed=i) for i in range(8)], float))
     assert_equal(*made, noise=0.1)
+
+
+def of_floor(scene, texels):
+    """Give the floor of `stage` these texels."""
+    params = mi.traverse(scene)
+    params["floor.bsdf.brdf_0.reflectance.data"] = mi.TensorXf(texels.astype(np.float32))
+    params.update()
+
+
+EVEN, FINE = np.full((TEXELS, TEXELS, 3), 0.5), np.random.default_rng(4).uniform(0.05, 0.95, (TEXELS, TEXELS, 3))
+
+
+@pytest.mark.parametrize("filter_type, frozen", [("bilinear", False), ("bilinear", True), ("nearest", False)])
+def test_textures_that_become_fine_come_to_be_held(filter_type, frozen):
+    """As a fresh integrator finds them, at the first change and at the second. (That a texture with jumps has become
+    even is not looked for.)"""
+    floor = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": bitmap(0, filter_type=filter_type)}}
+    scene, used = stage(floor=lambda: floor)(), mi.load_dict({"type": "direct_edge"})
+    initial = numbers(mi.traverse(scene)["sensor.to_world"])
+    step = Step().frozen() if frozen else Step()
+    changes = [(EVEN, False), (FINE, True), (EVEN, False)]
+    for texels, is_held in changes[: 2 if filter_type == "nearest" else 3]:
+        of_floor(scene, texels)
+        assert held(scene, used) == ["floor"] * is_held
+        fresh = mi.load_dict({"type": "direct_edge"})
+        with one_thread():
+            of = lambda step, it: losses_and_gradients(step, scene, it, "sensor.to_world", initial)
+            assert_same(of(step, used), of(Step(), fresh))
+
+
+def test_textures_are_looked_at_ever_more_rarely():
+    scene = stage()()
+    looks, found = Looks(), []
+    for k in range(20):
+        of_floor(scene, FINE + 0.001 * k)
+        before = looks.count
+        looks.at(parameters(scene))
+        if looks.count > before:
+            found.append(k)
+        looks.at(parameters(scene))  # nothing is replaced
+    assert found == [1, 2, 4, 8, 16]
 
 
 @pytest.mark.parametrize("what", ["no texture", "coarse texture", "mirror", "fisheye", "bdpt_edge", "rig"])
