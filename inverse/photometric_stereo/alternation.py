@@ -161,17 +161,10 @@ class Alternations:
 
     def view(self, guess: Guess, depth: np.ndarray) -> View:
         """Path trace a state."""
-        options = self.options
-        dr.flush_malloc_cache()  # of the fit before
-        self.rendering.update(guess, depth)
-        indirect = None
-        if options.max_depth > 2:
-            spp = max(options.spp, round(PATHS / self.data.mask.size))
-            indirect = self.rendering.indirect(spp=spp, seed=int(self.rng.integers(2**31)))
-            _smooth(indirect, self.data.mask, options.smoothing * np.sqrt(options.spp / spp))
-        view = self._seen(depth, indirect)
-        if indirect is not None:
-            view.strength = in_shadow.strength(self.data, indirect, ~view.seen & self.domain.lit[:, None])
+        seed = int(self.rng.integers(2**31)) if self.options.max_depth > 2 else 0
+        view = shown(self.rendering, self.lighting, guess, depth, self.options, seed)
+        if view.indirect is not None:
+            view.strength = in_shadow.strength(self.data, view.indirect, ~view.seen & self.domain.lit[:, None])
             if np.isfinite(view.strength):
                 view.indirect *= np.float32(view.strength)
         return view
@@ -179,12 +172,7 @@ class Alternations:
     def seen_again(self, course: Course) -> View:
         """The view of the newest state, of which the interreflections are known."""
         self.rendering.update(course.state.guess, course.state.depth)
-        return self._seen(course.state.depth, course.indirect)
-
-    def _seen(self, depth: np.ndarray, indirect: np.ndarray | None) -> View:
-        shown = self.options.shadows
-        seen = self.rendering.visible(self.lighting) if shown else np.ones(self.judge.counts.shape, bool)
-        return View(self.domain.points(depth), self.domain.normals(depth), seen, indirect)
+        return _seen(self.rendering, self.lighting, course.state.depth, course.indirect, self.options)
 
     def score(self, state: State, view: View) -> None:
         state.strength = view.strength
@@ -289,6 +277,28 @@ class Alternations:
             state.halves = _mean(mean_angle(self.judge.apart(guess, *of_view, lights=lights)))
             state.curl = self._curl(state)
         return state, view
+
+
+def shown(
+    rendering: Rendering, lighting: Lighting, guess: Guess, depth: np.ndarray, options: object, seed: int
+) -> View:
+    """What a guess with its depth shows, by path tracing."""
+    dr.flush_malloc_cache()  # of the fit before
+    rendering.update(guess, depth)
+    indirect = None
+    if options.max_depth > 2:
+        mask = rendering.data.mask
+        spp = max(options.spp, round(PATHS / mask.size))
+        indirect = rendering.indirect(spp=spp, seed=seed)
+        _smooth(indirect, mask, options.smoothing * np.sqrt(options.spp / spp))
+    return _seen(rendering, lighting, depth, indirect, options)
+
+
+def _seen(
+    rendering: Rendering, lighting: Lighting, depth: np.ndarray, indirect: np.ndarray | None, options: object
+) -> View:
+    seen = rendering.visible(lighting) if options.shadows else np.ones((lighting.P, lighting.K), bool)
+    return View(rendering.domain.points(depth), rendering.domain.normals(depth), seen, indirect)
 
 
 def _take(guess: Guess, other: Guess, pixels: np.ndarray) -> None:

@@ -80,6 +80,8 @@ class Dataset:
     distance: float | None = None
     #: What its files tell of faults, in sentences.
     doubts: tuple[str, ...] = ()
+    #: Which values are clipped, even in part, (P, K), bool. None: those that tell it by themselves.
+    over: np.ndarray | None = None
 
     def __post_init__(self):
         P, K, channels = self.values.shape
@@ -113,11 +115,10 @@ class Dataset:
 
     @functools.cached_property
     def clipped(self) -> np.ndarray:
-        """Which values are as large as the image could hold: (P, K), bool. They are where more than `CLIPPED` of all
-        values are the largest one, but for rounding."""
-        pictured = self.values * self.intensities.astype(np.float32)
-        found = (pictured >= (1 - 1e-4) * pictured.max()).any(2)
-        return found if CLIPPED < found.mean() < 1 - CLIPPED else np.zeros_like(found)
+        """Which values are as large as the image could hold: (P, K), bool."""
+        if self.over is not None:
+            return self.over
+        return as_large_as_possible((self.values * self.intensities.astype(np.float32)).max(2))
 
     @functools.cached_property
     def lit(self) -> np.ndarray:
@@ -190,15 +191,18 @@ class Dataset:
         camera = coarser(self.camera, step)
         truth = None if self.truth is None else directions_of(mean(self.truth))
         truth = truth if truth is not None and truth.any() else None
-        return replace(self, values=mean(self.values).astype(np.float32), mask=mask, camera=camera, truth=truth)
+        over = None if self.over is None else mean(self.over.astype(np.float32)) > 0
+        values = mean(self.values).astype(np.float32)
+        return replace(self, values=values, mask=mask, camera=camera, truth=truth, over=over)
 
     def without(self, numbers: Sequence[int]) -> Dataset:
         """The data set without some of its images."""
         kept = [k for k in range(len(self.lights)) if k not in numbers]
         lights = tuple(self.lights[k] for k in kept) if self.near else self.lights[kept]
         names = tuple(self.names[k] for k in kept) if self.names else ()
+        over = None if self.over is None else self.over[:, kept]
         return replace(
-            self, values=self.values[:, kept], lights=lights, intensities=self.intensities[kept], names=names
+            self, values=self.values[:, kept], lights=lights, intensities=self.intensities[kept], names=names, over=over
         )
 
     def blocks(self, step: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
@@ -208,13 +212,27 @@ class Dataset:
 
     def image(self, pixels: np.ndarray, fill: float = 0) -> np.ndarray:
         """(H, W, ...) of numbers of the pixels, (P, ...)."""
-        found = np.full((*self.mask.shape, *pixels.shape[1:]), fill, pixels.dtype)
-        found[self.mask] = pixels
-        return found
+        return image_of(self.mask, pixels, fill)
 
 
-def blocks(mask: np.ndarray, step: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Of the pixels of a mask, (H, W): see `Dataset.blocks`."""
+def image_of(mask: np.ndarray, pixels: np.ndarray, fill: float = 0) -> np.ndarray:
+    """(H, W, ...) of numbers of the pixels of a mask, (P, ...)."""
+    found = np.full((*mask.shape, *pixels.shape[1:]), fill, pixels.dtype)
+    found[mask] = pixels
+    return found
+
+
+def as_large_as_possible(pictured: np.ndarray) -> np.ndarray:
+    """Which of the values of images, (P, K), are as large as these could hold: where more than `CLIPPED` of all values
+    are the largest one, but for rounding."""
+    found = pictured >= (1 - 1e-4) * pictured.max()
+    return found if CLIPPED < found.mean() < 1 - CLIPPED else np.zeros_like(found)
+
+
+def blocks(
+    mask: np.ndarray, step: int, of: Callable[..., np.ndarray] | None = None
+) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Of the pixels of a mask, (H, W): see `Dataset.blocks`. of : in place of the mean, such as `np.maximum.reduceat`."""
     H, W = (-(-n // step) * step for n in mask.shape)
     whole = np.zeros((H, W), bool)
     whole[: mask.shape[0], : mask.shape[1]] = mask
@@ -228,6 +246,8 @@ def blocks(mask: np.ndarray, step: int) -> tuple[np.ndarray, Callable[[np.ndarra
     members = members[np.argsort(group[members], kind="stable")]
     first = np.flatnonzero(np.diff(group[members], prepend=-1))
     counts = np.diff(first, append=len(members))
+    if of is not None:
+        return coarse, lambda x: of(x[members], first, axis=0)
     mean = lambda x: np.add.reduceat(x[members], first, axis=0) / counts.reshape(-1, *[1] * (x.ndim - 1))
     return coarse, mean
 
@@ -250,7 +270,7 @@ def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # ---------------------- Folders ----------------------
 
 
-def read(folder: Path, *, images: int = 0) -> Dataset:
+def read(folder: Path, *, images: int = 0, reduce: int = 1) -> Dataset:
     """Read a folder as DiLiGenT's (Shi et al. 2019): `filenames.txt` (else all pictures but the mask, by name),
     `light_directions.txt` or `leds.csv`, `light_intensities.txt` (default 1), `mask.png`; if there, `K.txt` (3 x 3,
     else orthographic), `distance.txt` (see `Dataset.distance`), `light_distance.txt` (see `Dataset.with_near_lights`),
@@ -259,7 +279,8 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     Pictures are EXR, PNG or TIFF, which are taken to be linear as DiLiGenT's are, or JPEG, which is decoded from sRGB.
     Those that are black in the mask are left out, and logged. So are doubts about them, which the data set keeps.
 
-    images : read only so many, evenly from their list. 0: all.
+    images : read only so many, evenly from their list. 0: all. reduce : means over so many times so many pixels of the
+        mask are read, as those of images of less width: of these alone there is memory.
 
     Raises
     ------
@@ -268,9 +289,17 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     folder = Path(folder)
     setup = read_setup(folder, images=images)
     names, mask, intensities = setup.names, setup.mask, setup.intensities
-    values, lit = np.empty((mask.sum(), len(names), 3), np.float32), []
+    coarse, mean = blocks(mask, reduce)
+    _, largest = blocks(mask, reduce, np.maximum.reduceat)
+    if mask.any() and not coarse.any():
+        raise InputError(f"ps: the mask is too small: of a part of 1/{reduce} of its width, no pixel is left")
+    values, lit = np.empty((coarse.sum(), len(names), 3), np.float32), []
+    pictured = np.empty((len(values), len(names) if reduce > 1 else 0), np.float32)
     for k, name in enumerate(tqdm(names, desc="images", disable=True if len(names) < 10 else None, leave=False)):
-        values[:, len(lit)] = read_pixels(folder / name, mask) / intensities[k]
+        pixels = read_pixels(folder / name, mask)
+        values[:, len(lit)] = (mean(pixels) if reduce > 1 else pixels) / intensities[k]
+        if reduce > 1:
+            pictured[:, len(lit)] = largest(pixels.max(1))
         if not (values[:, len(lit)] <= 0).all():
             lit.append(k)
     if len(values) and not lit:
@@ -278,7 +307,7 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
     if 0 < len(lit) < len(names):
         black = ", ".join(name for k, name in enumerate(names) if k not in lit)
         log.warning("ps: black in the mask, and left out: %s; were these lamps on?", black)
-        setup, values = setup.chosen(lit), values[:, : len(lit)]
+        setup, values, pictured = setup.chosen(lit), values[:, : len(lit)], pictured[:, : len(lit)]
     doubts = files.doubts(folder, setup.names) + compression.judged(folder, setup.names, mask).said()
     few = every(values, JUDGED)
     if not setup.near and looks_encoded(
@@ -287,7 +316,12 @@ def read(folder: Path, *, images: int = 0) -> Dataset:
         doubts.append(ENCODED)
     for text in doubts:
         log.warning("ps: %s", text)
-    return replace(setup.dataset(values, mask, read_truth(folder, mask)), doubts=tuple(doubts))
+    data = replace(setup.reduced(reduce).dataset(values, coarse), doubts=tuple(doubts))
+    if reduce > 1:
+        data = replace(data, over=as_large_as_possible(pictured))
+    if (truth := read_truth(folder, mask)) is not None:
+        data = replace(data, truth=truth if reduce == 1 else directions_of(mean(truth)))
+    return data
 
 
 @dataclass(frozen=True)
@@ -313,9 +347,14 @@ class Setup:
         names = tuple(self.names[k] for k in numbers)
         return replace(self, names=names, lights=lights, intensities=self.intensities[numbers])
 
-    def dataset(self, values: np.ndarray, mask: np.ndarray, truth: np.ndarray | None = None) -> Dataset:
+    def reduced(self, step: int) -> Setup:
+        """Of images whose pixels are blocks of step x step."""
+        return replace(self, camera=coarser(self.camera, step)) if step > 1 else self
+
+    def dataset(self, values: np.ndarray, mask: np.ndarray) -> Dataset:
         """Of these pixels."""
-        data = Dataset(values, mask, self.lights, self.intensities, self.camera, truth, self.names, self.distance)
+        camera, names = self.camera, self.names
+        data = Dataset(values, mask, self.lights, self.intensities, camera, names=names, distance=self.distance)
         return data if self.away is None else data.with_near_lights(self.away)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import json
 from pathlib import Path
 
@@ -19,7 +20,9 @@ from rimlight.edge_sampling.geometry.meshes import make_mesh
 from rimlight.exr import replacing, write_exr
 from rimlight.inverse import page
 
+from .dataset import image_of
 from .direct import bsdf_of
+from .full_size import FullSize
 from .integration import depth_error, mesh_of
 from .reconstruction import Options, Result
 
@@ -28,6 +31,9 @@ NUMBERS = ("normals.exr", "depth.exr", "albedo.exr", "base.exr", "bsdf.json", "e
 
 #: Angles of incidence for which a BSDF is drawn, degrees.
 INCIDENCES = (0, 30, 60)
+
+#: What files say of normals and albedos.
+AXES, OF_ALBEDO = {"axes": "x right, y up, z towards the camera"}, {"unit": "of bsdf.json"}
 
 #: Resolution of pictures of plots, per inch.
 DPI = 130
@@ -60,12 +66,11 @@ def write_numbers(
         unit = "along the axis, " + (
             "unknown unit, geometric mean 1" if data.distance is None else "unit of distance.txt"
         )
-    write_exr(folder / "normals.exr", {"": data.image(guess.normals)}, {"axes": "x right, y up, z towards the camera"})
+    write_exr(folder / "normals.exr", {"": data.image(guess.normals)}, AXES)
     write_exr(folder / "depth.exr", {"": data.image(depth(result))[..., None]}, {"unit": unit})
-    write_exr(folder / "albedo.exr", {"": data.image(guess.albedo)[..., None]}, {"unit": "of bsdf.json"})
+    write_exr(folder / "albedo.exr", {"": data.image(guess.albedo)[..., None]}, OF_ALBEDO)
     if guess.base is not None:
-        unit_of_base = {"unit": "diffuse colour, of the images", "coat": f"index of refraction {guess.base_eta:g}"}
-        write_exr(folder / "base.exr", {"": data.image(guess.base / result.scale)}, unit_of_base)
+        write_exr(folder / "base.exr", {"": data.image(guess.base / result.scale)}, _of_base(result))
     weights, factor = bsdf(result)
     with replacing(folder / "bsdf.json") as temporary:
         ggx.write(temporary, result.lobes, weights)
@@ -115,9 +120,7 @@ def write_pictures(folder: Path, result: Result) -> None:
     OSError
     """
     data = result.data
-    encoded = np.round((data.image(result.guess.normals.astype(np.float32), -1) + 1) / 2 * 65535).astype(np.uint16)
-    with replacing(folder / "normals.png") as temporary:
-        mi.Bitmap(encoded).write(str(temporary), mi.Bitmap.FileFormat.PNG)
+    _write_picture(folder / "normals.png", data.image(result.guess.normals.astype(np.float32), -1))
     (folder / "uncertainty.exr").unlink(missing_ok=True)
     if result.uncertainty is not None:
         degrees = data.image(result.uncertainty.astype(np.float32), np.nan)[..., None]
@@ -131,6 +134,34 @@ def write_pictures(folder: Path, result: Result) -> None:
     mesh.add_attribute("vertex_albedo", 1, result.guess.albedo.astype(np.float32))
     with replacing(folder / "mesh.ply") as temporary:
         mesh.write_ply(str(temporary))
+
+
+def write_full_size(folder: Path, full: FullSize, result: Result) -> None:
+    """Write the normals and albedos of full images, in files as those of the result.
+
+    Raises
+    ------
+    OSError
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    image = functools.partial(image_of, full.mask)
+    write_exr(folder / "normals.exr", {"": image(full.normals)}, AXES)
+    _write_picture(folder / "normals.png", image(full.normals, -1))
+    if full.albedo is not None:
+        write_exr(folder / "albedo.exr", {"": image(full.albedo)[..., None]}, OF_ALBEDO)
+    else:
+        write_exr(folder / "base.exr", {"": image(full.base / np.float32(result.scale))}, _of_base(result))
+
+
+def _of_base(result: Result) -> dict[str, str]:
+    return {"unit": "diffuse colour, of the images", "coat": f"index of refraction {result.guess.base_eta:g}"}
+
+
+def _write_picture(path: Path, normals: np.ndarray) -> None:
+    """Of normals, (H, W, 3), 16 bits."""
+    encoded = np.round((normals + 1) / 2 * 65535).astype(np.uint16)
+    with replacing(path) as temporary:
+        mi.Bitmap(encoded).write(str(temporary), mi.Bitmap.FileFormat.PNG)
 
 
 # ---------------------- Parts of a result ----------------------

@@ -23,6 +23,7 @@ from rimlight.inverse.photometric_stereo import (
     calibration,
     cost,
     dataset,
+    full_size,
     inspection,
     inspection_page,
     output,
@@ -50,6 +51,11 @@ class Run:
     """Continue from the checkpoint in that folder."""
     images: int = 0
     """Use only this many of the images, spread evenly over their list. 0: all."""
+    reduce: int = 1
+    """Read images at this part of their width: 2 is half of it, and takes a quarter of the memory."""
+    full_size: bool = False
+    """With --reduce: fit the normals of the full images as well, from the surface that was found, some rows at a time.
+    They are written to the folder full_size."""
     variant: str = "llvm_ad_rgb"
     """Variant of Mitsuba."""
     threads: int = 0
@@ -63,6 +69,9 @@ class Run:
 
     def run(self) -> int:
         at_least(0, images=self.images, threads=self.threads, workers=self.workers)
+        at_least(1, reduce=self.reduce)
+        if self.full_size and self.reduce == 1:
+            raise InputError("--full-size: normals are those of the full images already; it goes with --reduce 2, say")
         one_cluster(self.workers, self.cluster)
         if not self.folders:
             raise InputError("name a folder with images, lights and a mask")
@@ -118,7 +127,8 @@ class Run:
             dr.set_thread_count(self.threads)
         with expected(OSError, ValueError):
             self._check_memory()
-            data, truth = dataset.read(self.folder, images=self.images), _true_depth(self.folder)
+            data = dataset.read(self.folder, images=self.images, reduce=self.reduce)
+            truth = _true_depth(self.folder)
         with expected(OSError):
             return self._reconstruct(data, truth)
 
@@ -144,14 +154,16 @@ class Run:
 
     def _check_memory(self) -> None:
         setup = dataset.read_setup(self.folder, images=self.images)
-        pixels, images = int(setup.mask.sum()), len(setup.names)
+        pixels, images = int(setup.mask.sum()) // self.reduce**2, len(setup.names)
+        if self.full_size:
+            full_size.check_space(setup, self.out)
         near = setup.near or setup.away is not None
         needed = cost.memory(pixels, images, self.options, near=near)
         if needed > (there := cost.available_memory()):
             raise InputError(
                 f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "
-                f"{there / 2**30:.1f} GiB are available; use fewer of the --images, smaller --resolutions, or "
-                "--no-near-lights"
+                f"{there / 2**30:.1f} GiB are available; use --reduce {2 * self.reduce}, with --full-size if need be, "
+                "fewer of the --images, smaller --resolutions, or --no-near-lights"
             )
 
     def _reconstruct(self, data: dataset.Dataset, truth: np.ndarray | None) -> tuple[int, list[str]]:
@@ -171,7 +183,7 @@ class Run:
                 found = reconstruction.reconstruct(
                     data,
                     self.options,
-                    progress=sys.stderr.isatty() and threading.current_thread() is threading.main_thread(),
+                    progress=_is_watched(),
                     after=after,
                     checkpoint=self.out / CHECKPOINT,
                     resume=self.resume,
@@ -181,19 +193,29 @@ class Run:
                 raise
             status = "interrupted"
             print("rimlight: interrupted; writing the best that was found; --resume goes on", file=sys.stderr)
+        lines = [f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s"]
+        if self.full_size and status == "finished":
+            lines += self._full_size(found)
         output.write_numbers(self.out, found, self.options, status=status, truth=truth)
         output.write_pictures(self.out, found)
         title = f"Photometric stereo: {self.folder.resolve().name}"
         report.write(self.out, found, self.options, title=title, status=status, truth=truth)
         if status == "finished":
             (self.out / CHECKPOINT).unlink(missing_ok=True)
-        lines = [f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s"]
         lines += [f"report: {self.out / 'report.html'}"]
         if (error := output.error_of_depth(found, truth)) is not None:
             lines += [f"mean error of depth {error:.3g} {'pixels' if data.camera is None else ''}".rstrip()]
         if found.error is not None:
             lines += [f"mean angular error {found.error:.2f} deg"]
         return (0 if status == "finished" else 130), lines
+
+    def _full_size(self, found: reconstruction.Result) -> list[str]:
+        """Normals of the full images, and what to say of them."""
+        options = {"reduce": self.reduce, "images": self.images, "progress": _is_watched()}
+        full = full_size.find(self.folder, self.out, found, self.options, **options)
+        output.write_full_size(self.out / "full_size", full, found)
+        said = "" if full.error is None else f", mean angular error {full.error:.2f} deg"
+        return [f"normals of {len(full.normals)} pixels: {self.out / 'full_size'}{said}"]
 
 
 def _attempts(kept: None, shared: None, jobs: Sequence[Run]) -> list[tuple[int, list[str]]]:
@@ -290,6 +312,11 @@ class Ps:
 
     def run(self) -> int:
         return self.command.run()
+
+
+def _is_watched() -> bool:
+    """Is there someone to show progress to?"""
+    return sys.stderr.isatty() and threading.current_thread() is threading.main_thread()
 
 
 def _true_depth(folder: Path) -> np.ndarray | None:
