@@ -295,6 +295,7 @@ class EdgeIntegrator(ADIntegrator):
         tracer = self.TRACER(scene, self)
         tracer.slides, tracer.lights, tracer.lamps = boundaries.slides, boundaries.lights, boundaries.lamps
         tracer.fine_mirrors = boundaries.fine_mirrors
+        tracer.moving = boundaries.shading.moving_shapes if boundaries.shading is not None else None
         if boundaries.held is not None:
             tracer.held = FirstPoints(boundaries.held, sensor)
         return Job(tracer, sensor, boundaries, counts, rays, seed, mode, self.TERMS, self.shares)

@@ -12,6 +12,7 @@ from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.choice.light_choice import LightChoice
+from rimlight.edge_sampling.geometry.meshes import is_met
 from rimlight.edge_sampling.parametrisation import Vicinity
 
 from .scattering import Next, Numbers, Scattering, next_vertex
@@ -113,6 +114,7 @@ class Choice:
     since : mi.UInt32, number of the last vertex up to there that does not slide with those before; 1 if all do.
     before : mi.UInt32, the same of the vertex before.
     density : mi.Float, by area, with which it was found from the vertex before; infinite if that is a mirror.
+    moved : mi.Bool, does it, or any vertex before it, lie on a shape that moves?
     """
 
     depth: mi.UInt32
@@ -121,6 +123,7 @@ class Choice:
     since: mi.UInt32
     before: mi.UInt32
     density: mi.Float
+    moved: mi.Bool
 
 
 def choose_vertices(
@@ -132,18 +135,23 @@ def choose_vertices(
     active: mi.Bool,
     beyond: Sequence[int],
     note: Callable[[Vertex, Numbers, Next, mi.Bool], None],
+    moving: Sequence[mi.ShapePtr] | None = None,
 ) -> list[Choice]:
     """Follow paths from their first vertex, and keep vertices of each, in proportion to its throughput (reservoirs of
     one): one for each number in `beyond`, which at least so many vertices may follow.
 
-    note : called with each vertex, its random numbers, and the next one.
+    note : called with each vertex, its random numbers, and the next one. moving : the shapes that move; None: all are
+    taken to do so.
     """
 
-    def bounce(totals, kept, vertex, since, before, density, active, sampler):
+    def bounce(totals, kept, vertex, since, before, density, moved, active, sampler):
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         bsdf = si.bsdf(vertex.ray)
         scatters = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        here = Choice(vertex.depth, vertex.β, mi.Bool(True), since, before, density * dr.abs_dot(si.n, vertex.ray.d))
+        for shape in moving or ():
+            moved |= is_met(si, shape)
+        cosine = dr.abs_dot(si.n, vertex.ray.d)
+        here = Choice(vertex.depth, vertex.β, mi.Bool(True), since, before, density * cosine, moved)
         number = sampler.next_1d(active)
         totals, kept = list(totals), list(kept)
         for i, more in enumerate(beyond):
@@ -158,7 +166,7 @@ def choose_vertices(
         before, since = since, dr.select(slides, since, vertex.depth + 1)
         density = dr.select(onwards.mirrored, dr.inf, bs.pdf / r2)
         vertex, active = step(vertex, onwards, sampler, depths, active)
-        return totals, kept, vertex, since, before, density, active, sampler
+        return totals, kept, vertex, since, before, density, moved, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
     width = dr.width(vertex.depth)
@@ -166,7 +174,7 @@ def choose_vertices(
     kept = [dr.zeros(Choice, width) for _ in beyond]
     for choice in kept:
         choice.depth = mi.UInt32(one)
-    first = vertex, mi.UInt32(one), mi.UInt32(one), zero
+    first = vertex, mi.UInt32(one), mi.UInt32(one), zero, dr.full(mi.Bool, moving is None, width)
     totals, kept, *_ = dr.while_loop(
         ([mi.Float(zero) for _ in beyond], kept, *first, active, sampler),
         lambda *state: state[-2],

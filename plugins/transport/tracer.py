@@ -55,6 +55,9 @@ class PathTracer:
     #: What is held where the camera sees it; None: nothing.
     held: FirstPoints | None = None
 
+    #: The shapes that move, where nothing else does; None: all are taken to do so.
+    moving: Sequence[mi.ShapePtr] | None = None
+
     #: See `rimlight.edge_sampling.boundaries.tracer.Tracer`.
     shares_directions = True
 
@@ -180,7 +183,7 @@ class PathTracer:
         first = camera_vertex(ray, self.first_hit(ray, True))
         if not self.scatters(2):
             return first
-        return Walk(self.scene, sampler, first, self.depths, self.slides, beyond, self.held)
+        return Walk(self.scene, sampler, first, self.depths, self.slides, beyond, self.held, self.moving)
 
     def point(
         self, ray: mi.Ray3f, walk: Walk | Vertex, mode: dr.ADMode, *, beyond: int = 0
@@ -203,7 +206,8 @@ class PathTracer:
             return ShadingPoint(si, walk.depth, walk.β, pi.is_valid(), no, still, mi.Float(0), turning), None
         chosen = walk.choice(beyond)
         c = walk.vertex(chosen, ray, mode, lamps)
-        moves = c.since < c.depth, c.vicinity
+        # Where lobes turn, it matters from where a vertex is looked at.
+        moves = (c.since < c.depth) & (chosen.moved if lamps is None else True), c.vicinity
         return ShadingPoint(c.si, c.depth, chosen.β, c.active, *moves, chosen.density, c.turning), c
 
     def scattered(

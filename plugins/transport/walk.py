@@ -16,6 +16,9 @@ from .log import Log
 from .paths import Choice, Depths, Vertex, choose_vertices
 from .replay import Chain, MovingVertex, written
 
+#: Where more shapes than these move, all vertices are taken to do so.
+FEW = 8
+
 
 class Walk:
     """Paths from the camera, and vertices of each, chosen in proportion to its throughput.
@@ -25,6 +28,7 @@ class Walk:
     slides : see `Vicinity`.
     beyond : one vertex is chosen for each of these numbers; at least so many more may follow it.
     held : what is held where the camera sees it.
+    moving : see `choose_vertices`.
     """
 
     def __init__(
@@ -36,11 +40,15 @@ class Walk:
         slides: Slides,
         beyond: Sequence[int],
         held: FirstPoints | None = None,
+        moving: Sequence[mi.ShapePtr] | None = None,
     ):
         # What is met first is used in the kernels of all, which are not to trace it again.
         dr.eval(first.ray, first.pi)
         self.beyond, self.first, vicinity = beyond, first, Vicinity.of(first.pi, slides)
         self._chain = chain = Chain(scene, vicinity, held=held)
+        # The direction that a mirror shows turns with its normal, even if its points stand still.
+        known = moving is not None and len(moving) <= FEW and not chain.scattering.any_mirror
+        moving = moving if known else None
 
         def follow(log: Log | None) -> list[Choice]:
             def note(vertex, numbers, onwards, active):
@@ -49,7 +57,8 @@ class Walk:
                         log.leave(vertex.depth, vertex.β, numbers, active)
                     log.arrive(vertex.depth + 1, onwards, active)
 
-            return choose_vertices(scene, sampler.clone(), first, depths, vicinity, first.pi.is_valid(), beyond, note)
+            begun = sampler.clone(), first, depths, vicinity, first.pi.is_valid()
+            return choose_vertices(scene, *begun, beyond, note, moving)
 
         longest = lambda choices: reduce(dr.maximum, [c.depth for c in choices])
         self._log, self._choices = written(scene, first.ray, 1, depths, follow, longest)

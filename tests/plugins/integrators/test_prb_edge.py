@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rimlight.checks import Motion, derivative_image, mean_and_error, z_scores
+from rimlight.terms.sampling import over_film
 
 DEPTH = 4
 
@@ -173,6 +174,29 @@ def test_terms_add_up(name, rough):
     assert all(np.abs(p).sum() > 0 for p in parts)
     total = jacobian_times(scene, motion)
     assert np.abs(sum(parts) - total).max() < 1e-4 * np.abs(total).max()
+
+
+def test_vertices_slide_with_what_moves():
+    """Where a point looks for edges that stand still, since it moves though its surface does not."""
+    scene = cases.cornell_box()
+    motion, theta = Motion(scene, **cases.BOX_SIDE), mi.Float(0)
+    dr.enable_grad(theta)
+    motion.apply(theta)
+    dr.forward(theta, dr.ADFlag.ClearEdges)
+    with dr.suspend_grad():
+        job = integrator().job(scene, 0, 1, 16, dr.ADMode.Forward)
+        job.boundaries.refit()
+        sampler, _ = over_film(job.sensor, 1, 16)
+        ray = job.sample_rays(sampler)[0]
+        point, _ = job.tracer.point(ray, job.tracer.walk(ray, sampler, [0]), dr.ADMode.Forward)
+    box = next(s for s in scene.shapes() if s.id() == "small-box")
+    later = np.array(point.active & (point.depth > 1) & (point.si.shape != mi.ShapePtr(box)))
+    moves, slides = (np.array(dr.grad(point.si.p)) != 0).any(0), np.array(point.slides)
+    motion.apply(0.0)
+    assert moves[later].sum() > 100
+    assert not (moves & ~slides)[later].any()
+    # Of all that is close to the vertex before, which is 42 % here.
+    assert (slides & ~moves)[later].mean() < 0.02
 
 
 def test_gradients_add_to_what_is_there():
