@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.crease import Directions
+from rimlight.edge_sampling.choice.bent_lamps import BentLamps
 from rimlight.edge_sampling.choice.light_choice import ChosenLight, LightChoice
 from rimlight.edge_sampling.choice.sampling import power_heuristic
 from rimlight.edge_sampling.divided_light import DividedLight
@@ -85,7 +86,7 @@ class Scattering:
         #: Emitters of several lights, see `rimlight.edge_sampling.lights.Lights`.
         self.several = [e for e in scene.emitters() if hasattr(e, "light_count") and e.sampling_weight() > 0]
         self.any_elsewhere = any(not f & (mi.EmitterFlags.Delta | mi.EmitterFlags.Surface) for f in flags)
-        self.held = Parametrisation(scene)
+        self.held, self.bent = Parametrisation(scene), BentLamps(scene)
         # The BSDFs inside of shape groups are not listed: assume the worst of an instance.
         bsdfs = [s.bsdf().flags() if s.bsdf() is not None else mi.BSDFFlags.All for s in scene.shapes()]
         self.any_mirror = any(f & mi.BSDFFlags.Delta for f in bsdfs)
@@ -149,14 +150,25 @@ class Scattering:
         """Radiance reflected at `si` by a sampled light: mi.Spectrum, (N,). directions : see `scatter`. chosen : which
         light."""
 
-        def towards_light(active):
+        if not len(self.bent):
             if chosen is None:
-                return self.scene.sample_emitter_direction(si, sample, False, active)
-            ds, weight = chosen.emitter.sample_direction(si, mi.Point2f(chosen.left, sample.y), active)
-            ds.pdf *= chosen.p
-            return ds, weight / chosen.p
-
-        return self.reflect(si, bsdf, towards_light, active, directions)
+                found = lambda active: self.scene.sample_emitter_direction(si, sample, False, active)
+            else:
+                found = lambda active: _of(chosen.emitter, si, mi.Point2f(chosen.left, sample.y), chosen.p, active)
+            return self.reflect(si, bsdf, found, active, directions)
+        with dr.suspend_grad():
+            if chosen is None:
+                index, over_p, left = self.scene.sample_emitter(sample.x, active)
+                emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index, active)
+                p = dr.rcp(over_p)
+            else:
+                emitter, p, left = chosen.emitter, chosen.p, chosen.left
+            at = dr.detach(si)
+            look = lambda u, active: _of(emitter, at, u, mi.Float(1), active)[1]
+            u, factor = self.bent.resample(emitter, look, mi.Point2f(left, sample.y), active)
+        L = self.reflect(si, bsdf, lambda active: _of(emitter, si, u, p, active), active, directions)
+        with dr.resume_grad(when=self.attached):
+            return L * factor
 
     def reflect(self, si, bsdf, towards_light, active, directions: Directions | MattDirections | None = None):
         """Radiance reflected at `si` by what `towards_light` samples: mi.Spectrum, (N,).
@@ -376,6 +388,13 @@ class Scattering:
             mine = without & (emitter == mi.EmitterPtr(several))
             L = dr.select(mine, several.eval_background(y, mine), L)
         return L
+
+
+def _of(emitter: mi.EmitterPtr, si, u: mi.Point2f, p: mi.Float, active) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """A light sample, and the light over its density: of emitters that were chosen with the probability p."""
+    ds, weight = emitter.sample_direction(si, u, active)
+    ds.pdf *= p
+    return ds, weight / p
 
 
 def next_vertex(
