@@ -232,7 +232,7 @@ def as_large_as_possible(pictured: np.ndarray) -> np.ndarray:
 def blocks(
     mask: np.ndarray, step: int, of: Callable[..., np.ndarray] | None = None
 ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Of the pixels of a mask, (H, W): see `Dataset.blocks`. of : in place of the mean, such as `np.maximum.reduceat`."""
+    """Of the pixels of a mask, (H, W): see `Dataset.blocks`. of : in place of means, such as `np.maximum.reduceat`."""
     H, W = (-(-n // step) * step for n in mask.shape)
     whole = np.zeros((H, W), bool)
     whole[: mask.shape[0], : mask.shape[1]] = mask

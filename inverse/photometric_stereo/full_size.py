@@ -218,7 +218,7 @@ def _fitted(
 def _with_means(
     normals: np.ndarray, means: np.ndarray, between: Between, rows: np.ndarray, columns: np.ndarray
 ) -> np.ndarray:
-    """Normals, (P, 3), whose means over coarse pixels are near `means`, (P', 3): what they lack is added, interpolated."""
+    """Normals, (P, 3), whose means over coarse pixels are near `means`, (P', 3): what these lack is interpolated."""
     block, now = between.block(rows, columns), np.zeros(means.shape)
     for c in range(3):
         now[:, c] = np.bincount(block, normals[:, c], len(means))
