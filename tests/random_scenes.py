@@ -325,7 +325,7 @@ class Generator:
         both = ("twosided", "principled", "principledthin")
         return bsdf if bsdf["type"] in both else {"type": "twosided", "inner": bsdf}
 
-    def emitter(self, low: float, high: float) -> dict:
+    def emitter(self, low: float, high: float, uv: bool = False) -> dict:
         return {"type": "area", "radiance": {"type": "rgb", "value": [self.uniform(low, high) for _ in range(3)]}}
 
     # ---------------------- Objects ----------------------
@@ -433,7 +433,8 @@ class Generator:
         if not closed:
             bsdf = self.two_sided(bsdf) if bsdf["type"] not in ("roughdielectric", "thindielectric", "mask") else bsdf
         lamp = (self.chance(0.15) and self.special not in ("cut", "mirrors")) or material == "black"
-        emitter = self.emitter(0.5, 3) if lamp else None
+        has_uv = uv or kind in ("cube", "smoothcube", "sphere", "cylinder", "disk")
+        emitter = self.emitter(0.5, 3, has_uv) if lamp else None
         smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
         smooth &= not lamp or kind == "fine"  # what coarse lamps light is off by some per cent, with a warning
         label = f"{'smooth-' if smooth and kind != 'fine' else ''}{kind}:{material}{':lamp' if lamp else ''}"

@@ -75,5 +75,7 @@ class TextureGenerator(Generator):
         bitmap = mi.Bitmap(normals.astype(np.float32))
         return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
 
-    def emitter(self, low: float, high: float) -> dict:
+    def emitter(self, low: float, high: float, uv: bool = False) -> dict:
+        if not uv:  # of meshes without, Mitsuba cannot sample a picture
+            return super().emitter(low, high, uv)
         return {"type": "area", "radiance": self.picture(low, high)}

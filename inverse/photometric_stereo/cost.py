@@ -11,8 +11,9 @@ from .direct import SAMPLED
 from .reconstruction import Options
 
 #: Bytes of the program; for each value, which is that of a pixel in an image, of reading; of a reconstruction at full
-#: size, for each value and for each pixel; and more for each value with near lights. Measured.
-FIXED, READING, OF_VALUE, OF_PIXEL, NEAR = 7e8, 28, 47, 1500, 20
+#: size, for each value and for each pixel; more for each value with near lights; and for each pixel of the full images,
+#: if means over some of them are read. Measured.
+FIXED, READING, OF_VALUE, OF_PIXEL, NEAR, OF_FULL = 7e8, 28, 47, 1500, 20, 150
 
 #: Seconds of one alternation: of any; on one core, for each value; and for each of those from which it fits the BSDF.
 #: Measured.
@@ -29,11 +30,13 @@ GROUPS = tuple(
 )
 
 
-def memory(pixels: int, images: int, options: Options, *, near: bool = False) -> float:
-    """Bytes, at most. near : have the lights positions? They may also get some."""
+def memory(pixels: int, images: int, options: Options, *, near: bool = False, reduce: int = 1) -> float:
+    """Bytes, at most. near : have the lights positions? They may also get some. reduce : as of `dataset.read`."""
+    whole = pixels * OF_FULL if reduce > 1 else 0
+    pixels = pixels / reduce**2
     values, finest = pixels * images, max(options.resolutions) ** 2
     of_value = OF_VALUE + NEAR * (near or options.near_lights)
-    return FIXED + values * READING + finest * (values * of_value + pixels * OF_PIXEL)
+    return FIXED + whole + values * READING + finest * (values * of_value + pixels * OF_PIXEL)
 
 
 def seconds(pixels: int, images: int, options: Options, cores: int | None = None) -> float:

@@ -116,7 +116,7 @@ def find(
     between, (rows, columns) = Between(data.mask, round(reduce / size)), np.nonzero(setup.mask)
     coloured = result.guess.base is not None
     normals, own = np.empty((len(rows), 3), np.float32), np.empty((len(rows), 3 if coloured else 1), np.float32)
-    with _Pixels(folder, out, setup, clipped=bool(data.clipped.any()), progress=progress) as pixels:
+    with Pixels(folder, out, setup, data, progress=progress) as pixels:
         at_once = max(int(AT_ONCE) // len(setup.names), 1)
         for i in tqdm(range(0, len(rows), at_once), desc="full size", disable=not progress):
             part = slice(i, i + at_once)
@@ -132,14 +132,15 @@ def find(
     return FullSize(setup.mask, normals, None if coloured else own[:, 0], own if coloured else None, error)
 
 
-class _Pixels:
+class Pixels:
     """The values of full images, in a file that has no name and goes with this process: image after image.
 
-    clipped : are values left out that are as large as the images can hold?
+    data : the same images, smaller; tells what values are divided by, and if some are clipped.
     """
 
-    def __init__(self, folder: Path, out: Path, setup: Setup, *, clipped: bool, progress: bool):
-        self.intensities, self.clipped, self.largest = setup.intensities.astype(np.float32), clipped, 0.0
+    def __init__(self, folder: Path, out: Path, setup: Setup, data: Dataset, *, progress: bool = False):
+        self.intensities, self.clipped = data.intensities.astype(np.float32), bool(data.clipped.any())
+        self.largest = 0.0
         self.count = int(setup.mask.sum())
         self.file = tempfile.TemporaryFile(dir=out)  # noqa: SIM115 (closed by `__exit__`)
         try:

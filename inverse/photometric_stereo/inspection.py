@@ -183,7 +183,7 @@ def warnings(found: Inspection) -> list[str]:
     if found.memory > (there := cost.available_memory()):
         said.append(
             f"A reconstruction would take {found.memory / 2**30:.1f} GiB of memory, of which {there / 2**30:.1f} GiB "
-            "are available, and will be refused: use fewer --images, or --resolutions 0.25 0.5 with --iterations 10 6."
+            "are available, and will be refused: use --reduce 2, with --full-size if need be, or fewer --images."
         )
     said += [*found.of_files, *found.compression.said(), *found.plausibility.said()]
     if found.plausibility.order.known and found.misfits is not None and found.misfits[1] < found.misfits[0]:

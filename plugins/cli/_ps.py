@@ -154,11 +154,11 @@ class Run:
 
     def _check_memory(self) -> None:
         setup = dataset.read_setup(self.folder, images=self.images)
-        pixels, images = int(setup.mask.sum()) // self.reduce**2, len(setup.names)
+        pixels, images = int(setup.mask.sum()), len(setup.names)
         if self.full_size:
             full_size.check_space(setup, self.out)
         near = setup.near or setup.away is not None
-        needed = cost.memory(pixels, images, self.options, near=near)
+        needed = cost.memory(pixels, images, self.options, near=near, reduce=self.reduce)
         if needed > (there := cost.available_memory()):
             raise InputError(
                 f"{images} images of {pixels} pixels would take {needed / 2**30:.1f} GiB of memory, "

@@ -66,6 +66,26 @@ def test_what_is_clipped_in_part_is_clipped(tmp_path, camera):
         np.testing.assert_allclose(found.camera, dataset.coarser(camera, 2))
 
 
+@pytest.mark.parametrize("of", ["distant lights", "rig"])
+def test_values_are_those_of_the_data_set(tmp_path, of):
+    """Of a rig, they are divided by what arrives from its distance."""
+    rng = np.random.default_rng(1)
+    lights = unit(np.array([[0, 0, 1.0], [1, 0, 1], [0, 1, 1], [-1, 0, 1]]))
+    values, intensities = rng.uniform(0, 1, (8 * 6, 4, 3)).astype(np.float32), rng.uniform(1, 2, (4, 3))
+    values[3, 2] = 9
+    camera = np.array([[60.0, 0, 3.5], [0, 60, 2.5], [0, 0, 1]]) if of == "rig" else None
+    folder, mask = tmp_path / "data", np.ones((6, 8), bool)
+    dataset.write(folder, dataset.Dataset(values, mask, lights, intensities, camera, distance=700.0))
+    if of == "rig":
+        (folder / dataset.LIGHT_DISTANCE).write_text("500")
+    smaller, whole = (dataset.read(folder, reduce=step) for step in (2, 1))
+    with full_size.Pixels(folder, tmp_path, dataset.read_setup(folder), smaller) as pixels:
+        found = [pixels.of(slice(i, i + 20), 3.0) for i in (0, 20, 40)]
+    np.testing.assert_allclose(np.concatenate([v for v, _ in found]), 3 * whole.values, rtol=1e-5)
+    over = np.concatenate([over for _, over in found])
+    assert (over == whole.clipped).all() and over.any()
+
+
 @pytest.mark.parametrize("step", [2, 3])
 def test_what_is_linear_is_interpolated_exactly(step):
     rows, columns = np.nonzero(np.ones((12, 18), bool))
