@@ -155,7 +155,7 @@ class Pixels:
                 raise OSError(error.errno, f'the disk of "{out}" is full') from error
             raise
 
-    def __enter__(self) -> _Pixels:
+    def __enter__(self) -> Pixels:
         return self
 
     def __exit__(self, *_: object) -> None:
