@@ -93,7 +93,14 @@ def check_space(setup: Setup, folder: Path) -> None:
 
 
 def find(
-    folder: Path, out: Path, result: Result, options: Options, *, reduce: int, images: int = 0, progress: bool = False
+    folder: Path | str,
+    out: Path | str,
+    result: Result,
+    options: Options,
+    *,
+    reduce: int,
+    images: int = 0,
+    progress: bool = False,
 ) -> FullSize:
     """Normals and albedos of the full images, of a result from smaller ones.
 
@@ -104,9 +111,10 @@ def find(
     ------
     ValueError : the images differ from those of the result. OSError : a file cannot be read, or the disk is full.
     """
+    folder, out = Path(folder), Path(out)
     setup = read_setup(folder, images=images)
     kept = [k for k, name in enumerate(setup.names) if name in result.data.names]
-    if len(kept) != len(result.data.names):
+    if len(kept) != len(result.data.lights):
         raise InputError("ps: the images of the folder are not those of the result")
     setup = setup.chosen(kept)
     size, data = options.resolutions[-1], result.data
