@@ -39,7 +39,6 @@ from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
-from rimlight.edge_sampling.fine_normals import fine_normals
 from rimlight.edge_sampling.fine_textures import Looks, fine_textures
 from rimlight.edge_sampling.first_points import HeldShapes, can_hold, has_points
 from rimlight.edge_sampling.geometry.grids import Grids
@@ -323,8 +322,8 @@ class BoundarySearch:
         return self.holds and can_hold(sensor) and not self.geometry.others
 
     def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
-        """The shapes whose points are held where the camera sees them, since they have fine textures, or are rough.
-        Found as the sensor of that moment sees them, and again when textures have changed: see `Looks`."""
+        """The shapes whose points are held where the camera sees them, since they have fine textures. Found as the
+        sensor of that moment sees them, and again when their textures have changed: see `Looks`."""
         if not self._may_hold(sensor):
             return None
         key = moving.camera, moving.flags
@@ -337,8 +336,7 @@ class BoundarySearch:
                 if has_points(s) and s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)
             ]
             as_edges = [inner(self.geometry.meshes[i]) for i in self._textures_on_film(moving, [])]
-            fine = [*fine_textures(scene, sensor, rough, as_edges), *fine_normals(scene, sensor, rough)]
-            fine = list(dict.fromkeys(fine))
+            fine = fine_textures(scene, sensor, rough, as_edges)
             if fine != (held.shapes if held is not None else []):
                 held = HeldShapes(scene, fine) if fine else None
             self._fine[key] = self._looks.count, held
