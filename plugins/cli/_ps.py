@@ -52,7 +52,7 @@ class Run:
     images: int = 0
     """Use only this many of the images, spread evenly over their list. 0: all."""
     reduce: int = 1
-    """Read images at this part of their width: 2 is half of it, and takes a quarter of the memory."""
+    """Divide width and height of the images by this number as they are read: 2 takes a quarter of the memory."""
     full_size: bool = False
     """With --reduce: fit the normals of the full images as well, from the surface that was found, some rows at a time.
     They are written to the folder full_size."""
@@ -193,14 +193,14 @@ class Run:
                 raise
             status = "interrupted"
             print("rimlight: interrupted; writing the best that was found; --resume goes on", file=sys.stderr)
-        lines = [f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s"]
-        if self.full_size and status == "finished":
-            lines += self._full_size(found)
         output.write_numbers(self.out, found, self.options, status=status, truth=truth)
         output.write_pictures(self.out, found)
         title = f"Photometric stereo: {self.folder.resolve().name}"
         report.write(self.out, found, self.options, title=title, status=status, truth=truth)
+        lines = [f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s"]
         if status == "finished":
+            # As long as there is a checkpoint, --resume goes on: after a disk was full, say.
+            lines += self._full_size(found) if self.full_size else []
             (self.out / CHECKPOINT).unlink(missing_ok=True)
         lines += [f"report: {self.out / 'report.html'}"]
         if (error := output.error_of_depth(found, truth)) is not None:

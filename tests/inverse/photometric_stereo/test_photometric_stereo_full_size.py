@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import errno
-import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -173,7 +173,7 @@ def test_what_cannot_be_is_refused(folder, tmp_path, capfd, options, texts):
 
 
 def test_space_is_checked_before(folder, tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(full_size.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(100, 99, 1))
+    monkeypatch.setattr(full_size.shutil, "disk_usage", lambda _: SimpleNamespace(free=1))
     assert main(["ps", "run", str(folder), "--out", str(tmp_path / "new" / "out"), *RUN]) == 2
     assert "full images need" in capfd.readouterr().err
 
