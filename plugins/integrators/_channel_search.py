@@ -9,6 +9,7 @@ import numpy as np
 
 from rimlight.edge_sampling import Edges, FilmBoundary, jumping_textures
 from rimlight.edge_sampling.boundaries.found import Boundaries
+from rimlight.edge_sampling.first_points import HeldShapes
 from rimlight.edge_sampling.geometry.edges import EdgeKind
 from rimlight.edge_sampling.geometry.meshes import has_texcoords
 from rimlight.transport.channels import LABELS, OF_TRIANGLES, Channel
@@ -41,7 +42,13 @@ class ChannelSearch(BoundarySearch):
         self.channels = channels
         self.kinds = {c.kind for c in channels}
 
-    def _find(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving, sppi: int) -> Boundaries:
+    def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
+        """No shape is held: channels are differentiated at a film position that is held."""
+        return None
+
+    def _find(
+        self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving, sppi: int, held: HeldShapes | None
+    ) -> Boundaries:
         on_film = np.array([m or moving.camera for m in moving.flags], bool)
         film = None
         if on_film.any():
