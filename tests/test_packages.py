@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
+import pkgutil
 import re
 import sys
 import tarfile
@@ -64,6 +66,26 @@ def test_public_functions_have_types(module):
         if inspect.Signature.empty in given:
             untyped.append(name)
     assert not untyped
+
+
+def test_methods_take_what_those_take_that_they_override():
+    """By position: a caller does not know which of the two it calls."""
+    positional = lambda f: [p.name for p in inspect.signature(f).parameters.values() if p.kind is not p.KEYWORD_ONLY]
+    wrong, overridden = [], 0
+    for found in pkgutil.walk_packages(rimlight.__path__, "rimlight."):
+        if found.name.endswith("__main__"):
+            continue
+        classes = [c for c in vars(importlib.import_module(found.name)).values() if inspect.isclass(c)]
+        for cls in (c for c in classes if c.__module__ == found.name):
+            for name, method in vars(cls).items():
+                above = next((vars(b)[name] for b in cls.__mro__[1:] if name in vars(b)), None)
+                if name.startswith("__") or not (inspect.isfunction(method) and inspect.isfunction(above)):
+                    continue
+                if above.__module__.startswith("rimlight."):
+                    overridden += 1
+                    if positional(method)[: len(positional(above))] != positional(above):
+                        wrong.append(f"{cls.__qualname__}.{name}")
+    assert overridden and not wrong
 
 
 @pytest.mark.parametrize("module", [rimlight, checks, inverse, photometric_stereo], ids=lambda m: m.__name__)
