@@ -25,9 +25,14 @@ class SmoothLamps:
     DRJIT_STRUCT = dict.fromkeys(("_shapes",))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene):
+        self._shapes = [mi.ShapePtr(s) for s in self.shapes(scene)]
+
+    @staticmethod
+    def shapes(scene: mi.Scene) -> list[mi.Shape]:
+        """The lamps."""
         plain = [e for e in scene.emitters() if not e.flags() & mi.EmitterFlags.SpatiallyVarying]
         shapes = [e.get_shape() for e in plain if e.get_shape() is not None]
-        self._shapes = [mi.ShapePtr(s) for s in shapes if s.is_mesh() and has_interpolated_normals(s)]
+        return [s for s in shapes if s.is_mesh() and has_interpolated_normals(s)]
 
     def __len__(self) -> int:
         return len(self._shapes)

@@ -18,6 +18,7 @@ from .film_boundary import FilmBoundary
 from .fine_mirrors import FineMirrors
 from .horizons_at_points import HorizonsAtPoints
 from .indirect_shadows import IndirectShadows
+from .lamp_planes import LampPlanes
 from .shading_boundary import ShadingBoundary
 from .shadow_boundary import ShadowBoundary
 from .shown_shadows import ShownShadows
@@ -33,7 +34,7 @@ class Boundaries:
     `lights` : chooses one, where there are many. `lamps` : how their light is divided.
     `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from surfaces.
     `horizons` : where interpolated normals turn away from points. `held` : shapes whose points are held where the
-    camera sees them."""
+    camera sees them. `lamp_planes` : of coarse lamps with interpolated normals."""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -55,6 +56,7 @@ class Boundaries:
     lamps: DividedLight | None = None
     horizons: HorizonsAtPoints | None = None
     held: HeldShapes | None = None
+    lamp_planes: LampPlanes | None = None
 
     @property
     def silhouettes(self) -> Silhouettes | None:

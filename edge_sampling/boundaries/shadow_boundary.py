@@ -122,7 +122,7 @@ class ShadowBoundary:
             light = self._point_on_light(tracer.scene, choice, time, sampler.next_2d())
             edge = self._edge(placement, light, sampler)
             shadow = fall(tracer.scene, light, edge)
-            view = _look(tracer, projection, sensor, sampler, light.time, shadow)
+            view = look(tracer, projection, sensor, sampler, light.time, shadow)
             near, whole = dr.norm(edge.p - view.si.p), dr.norm(light.y - view.si.p)
             part = partial(share_at_first, tracer.lamps, light.emitter, near, whole)
             ours = (lambda *pdfs: part(power_heuristic(*pdfs))) if share else None
@@ -416,7 +416,7 @@ def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
     return Shadow(x, facing, lift, fallen.shape, onwards, ray, fallen, active)
 
 
-def _look(
+def look(
     tracer: Tracer, projection: Projection, sensor: mi.Sensor, sampler: mi.Sampler, time: mi.Float, shadow: Shadow
 ) -> SeenShadow:
     """Does the sensor see it?"""

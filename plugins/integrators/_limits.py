@@ -112,7 +112,7 @@ def lasting_limits(
         limits += reflected_light(scene, geometry, depths, from_points=from_points)
         limits += shut_in_lamps(scene, moving) if depths.scatters(2) else []
         if depths.scatters(1):
-            limits += coarse_lamps(scene) + distant_scene(scene)
+            limits += coarse_lamps(scene, depths, planes=planes) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
     return (
         *limits,

@@ -35,6 +35,7 @@ from rimlight.edge_sampling import (
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.found import Boundaries
 from rimlight.edge_sampling.boundaries.horizons_at_points import HorizonsAtPoints
+from rimlight.edge_sampling.boundaries.lamp_planes import LampPlanes
 from rimlight.edge_sampling.boundaries.shown_shadows import ShownShadows
 from rimlight.edge_sampling.boundaries.veils import has_veils
 from rimlight.edge_sampling.choice.light_choice import LightChoice
@@ -55,6 +56,7 @@ from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
 from ._clipping import cut_by_clipping_planes
+from ._coarse_limits import FRINGE
 from ._limits import Media, Moving, PartialParameters, is_mirror, lasting_limits, refuse_timed_sky
 
 #: Parameters of a light that move the shadows in it, or the border of its beam.
@@ -292,7 +294,9 @@ class BoundarySearch:
         slides = Slides.BEHIND_GLASS if glass else Slides.NOTHING
         what = moving.flags, moving.camera, moving.lights
         chains = self._chains(scene, moving, sppi, at_rest)
-        others = LightChoice.of(scene), deep, lamps, horizons, held
+        coarse = sppi and self.planes and self.depths.scatters(1)
+        coarse = LampPlanes.of(scene, self.geometry, FRINGE) if coarse else None
+        others = LightChoice.of(scene), deep, lamps, horizons, held, coarse
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, *others)
 
     @staticmethod

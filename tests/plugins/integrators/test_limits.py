@@ -214,15 +214,24 @@ def test_gradients_of_media_are_refused(key):
         mi.load_dict({"type": "direct_edge"}).render_forward(scene, params, spp=1)
 
 
-@pytest.mark.parametrize("coarse", [True, False])
-def test_fringe_of_coarse_lamps(coarse):
+@pytest.mark.parametrize(
+    ("quads", "integrator", "warned"),
+    [
+        (4, {"type": "direct_edge"}, False),
+        (4, {"type": "prb_edge", "max_depth": 3}, True),
+        (40, {"type": "prb_edge", "max_depth": 3}, False),
+        (4, {"type": "rig", "max_depth": 2}, True),
+    ],
+)
+def test_fringe_of_coarse_lamps(quads, integrator, warned):
     """The interpolated normals of a coarse ball turn away well inside of its outline."""
-    points, _, _, faces = ball(4 if coarse else 40)
+    points, _, _, faces = ball(quads)
     lamp = cases.mesh("lamp", 0.3 * points + [0, 2, 0], faces, normals=True, emitter=cases.light(3, 2, 1))
     floor = cases.horizontal((0, 0, 0), 2, "floor", bsdf=cases.diffuse(0.5))
     scene = cases.scene(sensor=cases.camera(), lamp=lamp, floor=floor)
-    found = [message for message in said(scene, "lamp.vertex_positions") if "coarse mesh" in message]
-    assert len(found) == coarse and all('"lamp"' in message for message in found)
+    plan = rimlight.plan(scene, ["lamp.vertex_positions"], integrator=mi.load_dict(integrator))
+    found = [limit for limit in plan.limits if "coarse mesh" in limit]
+    assert len(found) == warned and all('"lamp"' in limit for limit in found)
 
 
 @pytest.mark.parametrize(
