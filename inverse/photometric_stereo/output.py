@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -45,7 +46,7 @@ def snapshot(result: Result) -> Result:
 
 
 def write_numbers(
-    folder: Path, result: Result, options: Options, *, status: str, truth: np.ndarray | None = None
+    folder: Path, result: Result, options: Options, *, status: str, truth: np.ndarray | None = None, reduce: int = 1
 ) -> None:
     """Write what was found, each file at once: after an alternation, say, lest it is lost.
 
@@ -53,7 +54,7 @@ def write_numbers(
     resolution reached. ``bsdf.json``: for the plugin ``ggx_dictionary``, see `bsdf`. ``exposures.txt``: a line for
     each image. ``metadata.json``.
 
-    status : "running", "finished" or "interrupted". truth : (H, W), of depth.
+    status : "running", "finished" or "interrupted". truth : (H, W), of depth. reduce : as of `dataset.read`.
 
     Raises
     ------
@@ -92,6 +93,7 @@ def write_numbers(
         "seconds": round(result.seconds, 3),
         "size": [*data.mask.shape[::-1]],
         "pixels": len(data.values),
+        "reduce": reduce,
         "images": list(data.names) or len(data.lights),
         "unit_of_depth": unit,
         "factor_of_bsdf": factor,
@@ -99,6 +101,10 @@ def write_numbers(
         "versions": versions(),
         "history": result.history,
     }
+    _write_metadata(folder, content)
+
+
+def _write_metadata(folder: Path, content: dict[str, Any]) -> None:
     with replacing(folder / "metadata.json") as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
@@ -137,7 +143,7 @@ def write_pictures(folder: Path, result: Result) -> None:
 
 
 def write_full_size(folder: Path, full: FullSize, result: Result) -> None:
-    """Write the normals and albedos of full images, in files as those of the result.
+    """Write the normals and albedos of full images, in files as those of the result, and ``metadata.json``.
 
     Raises
     ------
@@ -151,6 +157,8 @@ def write_full_size(folder: Path, full: FullSize, result: Result) -> None:
         write_exr(folder / "albedo.exr", {"": image(full.albedo)[..., None]}, OF_ALBEDO)
     else:
         write_exr(folder / "base.exr", {"": image(full.base / np.float32(result.scale))}, _of_base(result))
+    size = {"size": [*full.mask.shape[::-1]], "pixels": len(full.normals)}
+    _write_metadata(folder, {"mean_angular_error_degrees": full.error, **size, "versions": versions()})
 
 
 def _of_base(result: Result) -> dict[str, str]:

@@ -21,15 +21,16 @@ from rimlight.inverse.page import number
 from rimlight.sys_info import processor
 
 from . import nearness, output
-from .dataset import Dataset
+from .dataset import Dataset, image_of
 from .direct import Guess
+from .full_size import FullSize
 from .integration import normals_of
 from .reconstruction import Options, Result
 from .rendering import Rendering
 from .vectors import unit
 
-#: Largest width and height of pictures in the page, pixels.
-SHOWN = 320
+#: Largest width and height of pictures in the page, pixels; and of that of full images.
+SHOWN, WIDEST = 320, 960
 
 #: Photographs that are shown, and samples per pixel of what is rendered for the page.
 PHOTOGRAPHS, SPP = 4, 16
@@ -109,9 +110,17 @@ class View:
 
 
 def write(
-    folder: Path, result: Result, options: Options, *, title: str, status: str, truth: np.ndarray | None = None
+    folder: Path,
+    result: Result,
+    options: Options,
+    *,
+    title: str,
+    status: str,
+    truth: np.ndarray | None = None,
+    full: FullSize | None = None,
 ) -> None:
-    """Write ``report.html``. status : "finished", or "interrupted". truth : (H, W), of depth.
+    """Write ``report.html``. status : "finished", or "interrupted". truth : (H, W), of depth. full : of images that
+    were reduced.
 
     Raises
     ------
@@ -121,6 +130,7 @@ def write(
     sections = [
         f"<style>{STYLE}</style>\n<header>\n<h1>{html.escape(title)}</h1>\n{_verdict(result, status)}\n</header>",
         _shape(view, result, truth),
+        *([_full_size(full)] if full is not None else []),
         *_rendered(view, result, options),
         _progress(result),
         _reflectance(view, result),
@@ -176,6 +186,18 @@ def _shape(view: View, result: Result, truth: np.ndarray | None) -> str:
     plot = "" if truth is None else _cross_section(result, truth)
     both, scale = f'<div class="maps">{"".join(figures)}</div>', _scale(colours, *ends, of_depth)
     return "\n".join([*sections, both, scale, plot, "</section>"])
+
+
+def _full_size(full: FullSize) -> str:
+    """Normals of the full images, of every few pixels."""
+    step = -(-max(full.mask.shape) // WIDEST)
+    shown = image_of(full.mask, full.normals, np.nan)[::step, ::step]
+    facts = f"{len(full.normals)} pixels" + ("" if full.error is None else f", mean angular error {full.error:.2f}°")
+    every = "" if step == 1 else f" One in {step} is shown, in each direction."
+    return (
+        f"<section>\n<h2>Full images</h2>\n<p>{facts}, in the folder <code>full_size</code>.{every}</p>\n"
+        f'<div class="maps">{_figure(_coloured_normals(shown), "Normals")}</div>\n</section>'
+    )
 
 
 def _rendered(view: View, result: Result, options: Options) -> list[str]:

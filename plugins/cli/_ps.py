@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -168,12 +169,13 @@ class Run:
 
     def _reconstruct(self, data: dataset.Dataset, truth: np.ndarray | None) -> tuple[int, list[str]]:
         found: reconstruction.Result | None = None
+        write_numbers = partial(output.write_numbers, self.out, options=self.options, truth=truth, reduce=self.reduce)
         pressed: list[bool] = []
 
         def after(result: reconstruction.Result) -> None:
             nonlocal found
             found = output.snapshot(result)
-            output.write_numbers(self.out, found, self.options, status="running", truth=truth)
+            write_numbers(found, status="running")
             if pressed:
                 raise KeyboardInterrupt
 
@@ -193,15 +195,20 @@ class Run:
                 raise
             status = "interrupted"
             print("rimlight: interrupted; writing the best that was found; --resume goes on", file=sys.stderr)
-        output.write_numbers(self.out, found, self.options, status=status, truth=truth)
+        write_numbers(found, status=status)
         output.write_pictures(self.out, found)
         title = f"Photometric stereo: {self.folder.resolve().name}"
-        report.write(self.out, found, self.options, title=title, status=status, truth=truth)
+        write_report = partial(report.write, self.out, found, self.options, title=title, status=status, truth=truth)
+        write_report()
         lines = [f"{status}: {len(found.history)} alternations in {found.seconds:.1f} s"]
         if status == "finished":
             # As long as there is a checkpoint, --resume goes on: after a disk was full, say.
-            lines += self._full_size(found) if self.full_size else []
-            (self.out / CHECKPOINT).unlink(missing_ok=True)
+            try:
+                lines += self._full_size(found, write_report) if self.full_size else []
+                (self.out / CHECKPOINT).unlink(missing_ok=True)
+            except KeyboardInterrupt:
+                status = "interrupted"
+                print("rimlight: interrupted before the full images were fitted; --resume does it", file=sys.stderr)
         lines += [f"report: {self.out / 'report.html'}"]
         if (error := output.error_of_depth(found, truth)) is not None:
             lines += [f"mean error of depth {error:.3g} {'pixels' if data.camera is None else ''}".rstrip()]
@@ -209,11 +216,12 @@ class Run:
             lines += [f"mean angular error {found.error:.2f} deg"]
         return (0 if status == "finished" else 130), lines
 
-    def _full_size(self, found: reconstruction.Result) -> list[str]:
+    def _full_size(self, found: reconstruction.Result, write_report: Callable[..., None]) -> list[str]:
         """Normals of the full images, and what to say of them."""
         options = {"reduce": self.reduce, "images": self.images, "progress": _is_watched()}
         full = full_size.find(self.folder, self.out, found, self.options, **options)
         output.write_full_size(self.out / "full_size", full, found)
+        write_report(full=full)
         said = "" if full.error is None else f", mean angular error {full.error:.2f} deg"
         return [f"normals of {len(full.normals)} pixels: {self.out / 'full_size'}{said}"]
 

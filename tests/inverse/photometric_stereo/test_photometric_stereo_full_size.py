@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -159,7 +160,28 @@ def test_the_command_writes_them(folder, tmp_path, capsys):
         assert layer.shape == (*mask.shape, channels) and (layer[mask] != 0).any(1).all() and not layer[~mask].any()
         (layer,) = read_exr(out / f"{name}.exr")[0].values()
         assert layer.shape[0] == mask.shape[0] // 2
-    assert {path.name for path in (out / "full_size").iterdir()} == {"normals.exr", "normals.png", "albedo.exr"}
+    assert {path.name for path in (out / "full_size").iterdir()} == {
+        "normals.exr", "normals.png", "albedo.exr", "metadata.json"
+    }  # fmt: skip
+    told = {at: json.loads((out / at / "metadata.json").read_text("utf-8")) for at in ("", "full_size")}
+    assert told[""]["reduce"] == 2 and told["full_size"]["pixels"] == mask.sum()
+    assert told["full_size"]["size"] == [*mask.shape[::-1]] and told["full_size"]["mean_angular_error_degrees"] < 30
+    page = (out / "report.html").read_text("utf-8")
+    assert "Full images" in page and f"{mask.sum()} pixels" in page
+
+
+def test_interrupted_runs_fit_them_later(folder, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+
+    def pressed(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(full_size, "find", pressed)
+        assert main(["ps", "run", str(folder), "--out", str(out), *RUN]) == 130
+    assert "--resume" in capsys.readouterr().err and (out / "report.html").exists()
+    assert main(["ps", "run", str(folder), "--out", str(out), *RUN, "--resume"]) == 0
+    assert (out / "full_size" / "normals.exr").exists()
 
 
 @pytest.mark.parametrize(
