@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.geometry.meshes import is_positions_key
 from rimlight.edge_sampling.refusals import InputError
 
 #: Most names that a message lists.
@@ -106,7 +107,9 @@ def plan(
     unknown = [k for k in keys if k not in known]
     if unknown:
         raise InputError(f"plan: unknown parameter {', '.join(unknown)}")
-    before = {k: known[k] for k in keys}
+    # Copies, since `known` hands out what the scene itself holds. Where positions are set, Mitsuba makes normals anew.
+    copy = lambda names: {k: type(known[k])(known[k]) for k in names if k in known}
+    before, normals = copy(keys), copy(k.removesuffix("positions") + "normals" for k in keys if is_positions_key(k))
     try:
         for k in keys:
             known[k] = type(before[k])(dr.detach(before[k]))
@@ -114,9 +117,10 @@ def plan(
         known.update()
         return integrator.plan(scene, sensor, spp)
     finally:
-        for k, value in before.items():
-            known[k] = value
-        known.update()
+        for values in (before, normals):
+            for k, value in values.items():
+                known[k] = value
+            known.update()
 
 
 def counted(number: int, what: str) -> str:

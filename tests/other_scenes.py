@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import rimlight  # noqa: F401  # isort: skip (first: it chooses the LLVM library)
+import rimlight  # isort: skip (first: it chooses the LLVM library)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -94,8 +94,16 @@ def motions(scene: mi.Scene, rng: random.Random) -> Iterator[tuple[str, list[flo
         yield key, [1.0], step
 
 
+def tested(depth: int) -> mi.Integrator:
+    return mi.load_dict({"type": "prb_edge", "max_depth": depth, "rr_depth": 1000})
+
+
+def warnings(scene: mi.Scene, key: str, depth: int) -> list[str]:
+    return list(rimlight.plan(scene, [key], integrator=tested(depth)).limits)
+
+
 def agreement(scene: mi.Scene, key: str, direction: list[float], step: float, args: argparse.Namespace) -> Agreement:
-    integrator = mi.load_dict({"type": "prb_edge", "max_depth": args.depth, "rr_depth": 1000})
+    integrator = tested(args.depth)
     motion = Motion(scene, key, direction=direction)
     runs = [derivative_image(scene, integrator, motion, spp=args.spp, seed=100 + i) for i in range(args.runs)]
     for part in (1.0, 0.1):
@@ -120,7 +128,7 @@ def rows(path: Path, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         began, row = time.time(), {"scene": path.name, "key": key}
         try:
             found = agreement(scene, key, direction, step, args)
-            row |= {"said": str(found), "faults": found.faults(noise=1.0), "noise": found.noise, "scale": found.scale}
+            row |= {"said": str(found), "faults": found.faults(noise=1.0), "warned": warnings(scene, key, args.depth)}
         except Exception as error:
             row |= {"raised": f"{type(error).__name__}: {str(error)[:300]}"}
         yield row | {"seconds": round(time.time() - began)}

@@ -105,7 +105,7 @@ def finite_differences(
                 run.append((images[0] - images[1]) / (ends[0] - ends[1]))
             differences.append(run)
     finally:
-        motion.apply(0.0)
+        motion.restore()
     whole, half = np.mean(differences, axis=0)
     standard_error = np.std([d[1] for d in differences], axis=0, ddof=1) / np.sqrt(runs)
     settings = {

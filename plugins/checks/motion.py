@@ -67,6 +67,9 @@ class Motion:
             raise InputError(f'"{key}" has no vertices to choose from')
 
         self.initial = type(value)(dr.detach(value))
+        # Where positions are set, Mitsuba makes the normals of vertices anew.
+        normals = key.removesuffix("positions") + "normals"
+        self.normals = {k: type(self.params[k])(dr.detach(self.params[k])) for k in [normals] if k in self.params}
         geometric = self.is_positions or self.is_transform
         size = 3 if geometric else dr.prod(dr.shape(value))
         self.direction = (
@@ -124,6 +127,13 @@ class Motion:
         self.params[self.key] = value
         self.params.update()
 
+    def restore(self) -> None:
+        """Leave the scene as it was: the parameter, and of a mesh that moved also the normals of its vertices."""
+        for values in ({self.key: self.initial}, self.normals):
+            for key, value in values.items():
+                self.params[key] = type(value)(value)
+            self.params.update()
+
     def _transform(self, theta: mi.Float) -> mi.AffineTransform4f:
         T = mi.Transform4f
         if self.rotate is None:
@@ -151,7 +161,7 @@ def derivative_image(
         image = integrator.render_forward(scene, motion.params, sensor=sensor, seed=seed, spp=spp)
         dr.eval(image)
     finally:
-        motion.apply(0.0)
+        motion.restore()
     return image
 
 

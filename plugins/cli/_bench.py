@@ -171,7 +171,7 @@ def balance(integrator: Any, scene: mi.Scene, motion: Motion, spp: int) -> None:
     motion.apply(theta)
     dr.forward(theta, dr.ADFlag.ClearEdges)
     integrator.balance(scene, motion.params, spp=spp)
-    motion.apply(0.0)
+    motion.restore()
 
 
 def row(
