@@ -36,14 +36,14 @@ def derivatives(case: cases.Case, term: str | None, spp: int, runs: int, shares=
     return np.array([render(1 + i) for i in range(runs)]), (time.process_time() - began) / runs
 
 
-def balance(case: cases.Case) -> dict[str, float]:
-    """The shares of the terms, measured, and printed."""
+def balance(case: cases.Case, spp: int) -> dict[str, float]:
+    """The shares of the terms, measured with so many samples per pixel, and printed."""
     scene, integrator = case.scene(), _integrator(case)
     motion, theta = Motion(scene, **case.motion), mi.Float(0)
     dr.enable_grad(theta)
     motion.apply(theta)
     dr.forward(theta, dr.ADFlag.ClearEdges)
-    found = integrator.balance(scene, motion.params)
+    found = integrator.balance(scene, motion.params, spp=spp)
     print(found)
     return found.shares
 
@@ -59,6 +59,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--all", action="store_true", help="only all terms together")
     parser.add_argument("--balanced", action="store_true", help="and all with the shares that `balance` finds")
+    parser.add_argument("--pilot", type=int, default=16, help="samples per pixel with which these are measured")
     args = parser.parse_args()
     if args.runs < 2:
         parser.error("noise shows from two runs on")
@@ -67,7 +68,7 @@ def main() -> None:
         case = cases.case(name)
         norm = np.abs(FiniteDifferences.read(case.reference).mean).sum()
         rows = [(term, None) for term in (None, *(() if args.all else (t.name for t in TERMS)))]
-        for term, shares in rows + ([(None, balance(case))] if args.balanced else []):
+        for term, shares in rows + ([(None, balance(case, args.pilot))] if args.balanced else []):
             images, seconds = derivatives(case, term, args.spp, args.runs, shares)
             mean = images.mean(0)
             noise = np.abs(images - mean).sum() / args.runs * np.sqrt(args.runs / (args.runs - 1)) / norm
