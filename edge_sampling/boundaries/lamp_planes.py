@@ -93,9 +93,9 @@ class LampPlanes:
             active = view.active & dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl, u = dr.select(active, n_dl, 0), dr.select(active, view.u, 0)
             # The direction, in parts of the two sides of the face with which it moves.
-            xx, xy, yy = (dr.dot(sides[i], sides[j]) for i, j in ((0, 0), (0, 1), (1, 1)))
-            a = dr.rcp(mi.Matrix2f(xx, xy, xy, yy)) @ mi.Vector2f(*(dr.dot(side, ω) for side in sides))
-            a = dr.select(active, a, 0)
+            front = dr.cross(*sides)
+            parts = (dr.dot(dr.cross(*pair), front) for pair in ((ω, sides[1]), (sides[0], ω)))
+            a = dr.select(active, mi.Vector2f(*parts) / dr.squared_norm(front), 0)
             if projection.attached:
                 dr.eval(jump, n_dl, active, view.seen, view.ray, face, a, b, shadow.facing, shadow.lift, u)
         with dr.resume_grad():
