@@ -217,7 +217,7 @@ class Subject:
     def images(self, moves: Sequence[dict[str, Any]], seeds: Sequence[int], spp: int) -> np.ndarray:
         """Derivatives: (N, H, W, C)."""
         scene, integrator = self.scene(), self.make_integrator()
-        together = Together(scene, moves)
+        together = Together.of(scene, moves)
         return np.array([derivative_image(scene, integrator, together, spp=spp, seed=s) for s in seeds], np.float64)
 
     def grown(self, names: Sequence[str], pivot: Vector, seed: int, spp: int) -> np.ndarray:
@@ -251,17 +251,31 @@ class Growth:
         self.params["sensor.to_world"] = mi.Transform4f().translate(theta * (eye - self.pivot)) @ self.pose
         self.params.update()
 
+    def restore(self) -> None:
+        self.apply(0)
+
 
 class Together:
     """Several motions with one θ, in place of a `Motion`."""
 
-    def __init__(self, scene: mi.Scene, moves: Sequence[dict[str, Any]]):
-        self.motions = [Motion(scene, **m) for m in moves]
-        self.params = self.motions[0].params
+    unit = "unit"
+
+    def __init__(self, motions: Sequence[Motion]):
+        self.motions = motions
+        self.params = motions[0].params
+
+    @staticmethod
+    def of(scene: mi.Scene, moves: Sequence[dict[str, Any]]) -> Together:
+        """From arguments of `Motion`."""
+        return Together([Motion(scene, **move) for move in moves])
 
     def apply(self, theta: mi.Float | float) -> None:
         for motion in self.motions:
             motion.apply(theta)
+
+    def restore(self) -> None:
+        for motion in self.motions:
+            motion.restore()
 
 
 def difference(a: np.ndarray, b: np.ndarray, tolerance: float = 0.0) -> Agreement:

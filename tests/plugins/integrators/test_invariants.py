@@ -174,7 +174,7 @@ def test_forward_is_backward(integrator, numbers):
     (image,) = subject.images(moves, [1], 16)
     weights = np.random.default_rng(0).uniform(-1, 1, image.shape).astype(np.float32)
     scene, θ = subject.scene(), mi.Float(0)
-    together = Together(scene, moves)
+    together = Together.of(scene, moves)
     dr.enable_grad(θ)
     together.apply(θ)
     rendered = mi.render(scene, together.params, integrator=subject.make_integrator(), spp=16, seed=2, seed_grad=1)

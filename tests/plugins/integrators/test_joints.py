@@ -55,7 +55,7 @@ def test_a_gap_is_none(gap, radius, joined, turn):
 
 def image(scene: mi.Scene, kind: str, moves: list[dict], seed: int, spp: int = 64) -> np.ndarray:
     made = mi.load_dict(INTEGRATORS[kind])
-    return np.array(derivative_image(scene, made, Together(scene, moves), seed=seed, spp=spp), np.float64)
+    return np.array(derivative_image(scene, made, Together.of(scene, moves), seed=seed, spp=spp), np.float64)
 
 
 @pytest.mark.parametrize(("kind", "of"), [("direct_edge", "sphere"), ("prb_edge", "can")])
@@ -94,7 +94,7 @@ def test_rims_are_found_again_when_shapes_move():
     for height in (0, 0.5):
         params[key] = mi.Transform4f().translate([0, height, 0]) @ closed
         params.update()
-        motion, new = Together(scene, joints.CAN), mi.load_dict(INTEGRATORS["direct_edge"])
+        motion, new = Together.of(scene, joints.CAN), mi.load_dict(INTEGRATORS["direct_edge"])
         a, b = (np.array(derivative_image(scene, made, motion, spp=16, seed=1), float) for made in (used, new))
         assert len(used.search.geometry.joints) == (1 if height else 2)
         np.testing.assert_allclose(a, b, atol=1e-4 * np.abs(b).max())

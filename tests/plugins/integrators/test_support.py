@@ -22,6 +22,7 @@ import leaves
 import mitsuba as mi
 import numpy as np
 import pytest
+from invariance import Together
 
 import rimlight
 from rimlight import merl_tables
@@ -286,22 +287,6 @@ ON_CHARTS = sorted(
 )
 
 
-@dataclass(frozen=True)
-class Together:
-    """Several motions at once, of one θ."""
-
-    motions: tuple[Motion, ...]
-    unit: str = "unit"
-
-    @property
-    def params(self):
-        return self.motions[0].params
-
-    def apply(self, theta) -> None:
-        for motion in self.motions:
-            motion.apply(theta)
-
-
 class Chart:
     """Cells side by side on the film, before a camera that sees them from the front, in the light of a lamp and of the
     sky."""
@@ -331,7 +316,7 @@ class Chart:
         )
         #: Mean derivative and its standard error, and the finite differences. The scene itself is not kept: as long as
         #: it lived, every kernel of every other test would contain its many materials.
-        self.measured = self._measure(scene, Together(tuple(self._motions(column, scene))))
+        self.measured = self._measure(scene, Together(list(self._motions(column, scene))))
 
     def place(self, k: int) -> np.ndarray:
         i, j = k % self.columns, k // self.columns
@@ -489,7 +474,7 @@ def light_images(trio: tuple[str, ...], column: str):
                 motions.append(Motion(scene, f"lamp{i}.to_world", **moves))
             elif in_light(row, column):
                 motions.append(Motion(scene, f"lamp{i}.{changes}", direction=[1]))
-    motion = Together(tuple(motions))
+    motion = Together(motions)
     name = re.sub(r"\W+", "_", "_".join([*trio, column])).strip("_")
     spp = 4096 if column == "passed" else 1024
     expected = reference(name, trio, scene, motion, step=0.1 if column == "changes" else 6e-3, spp=spp)
