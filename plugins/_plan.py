@@ -82,7 +82,7 @@ def plan(
     params: mi.SceneParameters | Iterable[str] | None = None,
     *,
     integrator: mi.Integrator | None = None,
-    sensor: int = 0,
+    sensor: int | mi.Sensor = 0,
     spp: int = 0,
 ) -> Plan:
     """What a derivative of this scene with respect to these parameters needs. The integrators follow the same plan.

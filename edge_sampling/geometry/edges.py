@@ -213,25 +213,26 @@ def _no_edges() -> Edges:
 
 def _weld_equal(point: np.ndarray) -> np.ndarray:
     """Number the distinct positions: (V,), int64. Adding zero makes +0 and -0 the same bits."""
-    bits = (point + np.float32(0)).view(np.uint32).astype(np.uint64)
-    # To sort one integer a row is several times faster than to sort rows: mix the three, and check for collisions.
-    mixed = (
-        bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
-        ^ bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F)
-        ^ bits[:, 2] * np.uint64(0x165667B19E3779F9)
-    )
-    _, first, weld = np.unique(mixed, return_index=True, return_inverse=True)
-    if not (bits[first[weld]] == bits).all():
-        _, weld = np.unique(bits, axis=0, return_inverse=True)
-    return weld.reshape(-1).astype(np.int64)
+    return distinct_rows((point + np.float32(0)).view(np.uint32))[1]
+
+
+def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number the distinct rows of two or three integers, in any order.
+
+    Returns of each number the first row that has it, (D,), and of each row its number, (N,), int64.
+    """
+    # To sort one integer a row is several times faster than to sort rows: mix them, and check for collisions.
+    _, first, number = np.unique(_mix(rows), return_index=True, return_inverse=True)
+    if not (rows[first[number]] == rows).all():
+        _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return first, number.reshape(-1).astype(np.int64)
 
 
 def _mix(rows: np.ndarray) -> np.ndarray:
-    """Hash the three columns of `rows` (uint64) into one."""
-    a, b, c = rows.T
-    return (
-        (a * np.uint64(0x9E3779B97F4A7C15)) ^ (b * np.uint64(0xC2B2AE3D27D4EB4F)) ^ (c * np.uint64(0x165667B19E3779F9))
-    )
+    """Hash the two or three columns of `rows` into one: uint64."""
+    odd = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
+    columns = rows.astype(np.uint64).T
+    return np.bitwise_xor.reduce([c * np.uint64(o) for c, o in zip(columns, odd, strict=False)])
 
 
 def _weld_close(
@@ -265,7 +266,7 @@ def _pair_sides(weld: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, ...]:
     n = int(weld.max()) + 1 if len(weld) else 1
     # Of triangles over the same three points, keep one.
     s = np.sort(w[alive], axis=1)
-    order = np.argsort(_mix(s.astype(np.uint64)))
+    order = np.argsort(_mix(s))
     s = s[order]
     repeated = np.zeros(len(s), bool)
     repeated[1:] = (s[1:] == s[:-1]).all(1)

@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from .device_edges import rounding
-from .edges import WHOLE, EdgeKind, Edges, Weld
+from .edges import WHOLE, EdgeKind, Edges, Weld, distinct_rows
 from .grids import is_grid
 from .meshes import Geometry, number_of, positions_of, tells_shapes_in_groups
 from .rigid_motion import Shapes
@@ -297,8 +297,8 @@ def line_edges(edges: Edges, n: int, vertices: int) -> Edges:
 def _each_once(found: list[mi.UInt32]) -> list[mi.UInt32]:
     """Pairs of triangles, each once: where the edges of two meshes meet, both find the pair from the same end."""
     corners = np.stack([f.numpy() for f in found], 1).reshape(-1, 3)
-    triangle = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)[1].reshape(-1, 2)
-    first = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True)[1]
+    triangle = distinct_rows(np.sort(corners, axis=1))[1].reshape(-1, 2)
+    first = np.sort(distinct_rows(np.sort(triangle, axis=1))[0])
     return [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)]
 
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.refusals import Refusal
 
-from .sensors import inside_frame
+from .sensors import inside_frame, sampled_border
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def film_parts(sensor: mi.Sensor) -> list[FilmPart]:
     if sensor.class_name() != "BatchSensor":
         return [FilmPart(sensor, mi.ScalarVector2f(0), mi.ScalarVector2f(1))]
     children = _children(sensor)
-    if any(s.film().sample_border() for s in (sensor, *children)):
+    if any(sampled_border(s.film()) for s in (sensor, *children)):
         raise Refusal(
             f'film boundary: batch sensor "{sensor.id()}" samples the border of its film, where Mitsuba mixes up the '
             'views; set "sample_border" to false.'

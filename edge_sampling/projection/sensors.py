@@ -409,9 +409,14 @@ def from_equidistant(angle: mi.Vector2f) -> mi.Vector3f:
     return mi.Vector3f(-sinc * angle.x, -sinc * angle.y, dr.cos(θ))
 
 
+def sampled_border(film: mi.Film) -> int:
+    """How wide the border is that is sampled around the film, in pixels. A box filter has none."""
+    return film.rfilter().border_size() if film.sample_border() else 0
+
+
 def frame(film: mi.Film) -> tuple[mi.ScalarPoint2f, mi.ScalarPoint2f]:
     """The part of the film that is sampled, in pixels: the crop window, and the border if the film asks for it."""
-    border = film.rfilter().border_size() if film.sample_border() else 0
+    border = sampled_border(film)
     lower = mi.ScalarPoint2f(film.crop_offset()) - border
     return lower, lower + mi.ScalarVector2f(film.crop_size()) + 2 * border
 

@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rimlight._collection import no_collection
+from rimlight.edge_sampling.projection.sensors import sampled_border
 from rimlight.edge_sampling.refusals import InputError
 from rimlight.exr import read_exr, write_exr
 
@@ -62,7 +63,7 @@ def finite_differences(
     spp: int = 4096,
     max_depth: int = 2,
     integrator: mi.Integrator | None = None,
-    sensor: int = 0,
+    sensor: int | mi.Sensor = 0,
     seed: int = 0,
     side: Literal[-1, 0, 1] = 0,
     progress: bool = False,
@@ -79,6 +80,7 @@ def finite_differences(
     runs : number of independent runs, at least 2; their spread gives the standard error.
     spp : samples per pixel of each image, a square number is best.
     max_depth : of `path`, unless another `integrator` is given.
+    sensor : its number in the scene, or itself, also one that is not part of the scene.
     side : 1 or -1 stands for differences to that side alone, (I(+h) − I(0)) / h or (I(0) − I(−h)) / h. If both differ
         however small h is, the image has no derivative: two surfaces begin to part, say. Then central differences are
         the mean of both.
@@ -92,7 +94,8 @@ def finite_differences(
     if runs < 2 or spp < 1:
         raise InputError(f"finite differences: need at least 2 runs and 1 sample per pixel, got {runs} and {spp}")
     integrator = integrator or mi.load_dict({"type": "path", "max_depth": max_depth})
-    camera = scene.sensors()[sensor]
+    spp = mi.load_dict({"type": "multijitter", "sample_count": spp}).sample_count()  # rounded once, not for each image
+    camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
     differences = []
     try:
         for i in tqdm(range(runs), desc="finite differences", disable=not progress):
@@ -146,7 +149,7 @@ def render_stratified(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sen
     spp = sampler.sample_count()
     # Sums of many more equal numbers are not exact enough in single precision: a difference of images shows it.
     passes = next(n for n in range(-(-spp // PASS), spp + 1) if spp % n == 0)
-    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    border = 2 * sampled_border(film)
     sampler.set_samples_per_wavefront(spp // passes)
     sampler.seed(seed, int(np.prod(np.array(film.crop_size()) + border)) * (spp // passes))
     images, names = [], integrator.aov_names()

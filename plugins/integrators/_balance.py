@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 RUNS = 4
 
 #: The least share, and its reciprocal the largest: measured noise may lack what is rare.
-LEAST = 1 / 8
+LEAST = 1 / 2
 
 
 @dataclass(frozen=True)

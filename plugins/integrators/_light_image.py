@@ -7,6 +7,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.projection.sensors import sampled_border
 from rimlight.transport.found_light import Seen
 
 #: Points at which a reconstruction filter is looked at along each pixel.
@@ -63,7 +64,7 @@ class LightImage:
     def _weights(self, axis: int, count: int) -> mi.Float:
         """Integral of the filter over what is sampled of the film along an axis, for each of the block's pixels."""
         rfilter, crop = self.film.rfilter(), self.film.crop_size()[axis]
-        sampled = rfilter.border_size() if self.film.sample_border() else 0
+        sampled = sampled_border(self.film)
         reach = math.ceil(rfilter.radius())
         along = dr.arange(mi.UInt32, count * 2 * reach * POINTS)
         pixel, point = along // (2 * reach * POINTS), along % (2 * reach * POINTS)

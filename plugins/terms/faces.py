@@ -18,7 +18,7 @@ from .term import Job
 class FacePlanesTerm(FromPoints):
     """What faces hide from themselves, where other normals than theirs shade."""
 
-    name, effort = "planes of faces", 3.0
+    name, effort = "planes of faces", 1.0
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0

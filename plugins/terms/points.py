@@ -79,7 +79,7 @@ def walked(job: Job) -> tuple[mi.Sampler, Walk | Vertex]:
 class PointsTerm(FromPoints):
     """Edges that hide, from a vertex, light that it would reflect."""
 
-    name, effort = "edges from points", 4.0
+    name, effort = "edges from points", 3.0
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0

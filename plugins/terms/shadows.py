@@ -19,7 +19,7 @@ from .term import FilmSamples, Job, Sample, Term
 class ShadowsTerm(Term):
     """Edges as the lights see them, and planes of coarse lamps, on each part of the film."""
 
-    name, effort = "shadows from lights", 3.0
+    name, effort = "shadows from lights", 2.0
 
     def planned(self, job: Job) -> PlannedTerm:
         shadows, shading = job.boundaries.shadows, job.boundaries.shading

@@ -100,6 +100,9 @@ def test_plan_counts_all_parts():
 @pytest.mark.parametrize("who", ["batch", "child"])
 def test_borders_are_refused(who):
     sensor = cases.batch()
-    (sensor if who == "batch" else sensor["left"])["film"]["sample_border"] = True
+    film = (sensor if who == "batch" else sensor["left"])["film"]
+    film |= {"sample_border": True, "rfilter": {"type": "gaussian"}}
     with pytest.raises(RuntimeError, match=r'batch sensor ".*" samples the border .* set "sample_border" to false'):
         film_parts(mi.load_dict(sensor))
+    film["rfilter"] = {"type": "box"}  # a border without width
+    assert len(film_parts(mi.load_dict(sensor))) == 2
