@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.geometry.boxes import box_of
 from rimlight.edge_sampling.geometry.meshes import Geometry
 
 from .views import Cone
@@ -49,7 +50,8 @@ class EmitterBoxes:
             if is_mesh:
                 box = box[::-1]
             elif shape is not None:
-                box = (np.array(shape.bbox().min), np.array(shape.bbox().max))
+                found = box_of(shape)
+                box = (np.array(found.min), np.array(found.max))
             lower.append(box[0])
             upper.append(box[1])
         # Where there is none, one that counts as everything: Dr.Jit 1.5 cannot freeze empty arrays.

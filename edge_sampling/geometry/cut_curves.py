@@ -24,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .boxes import box_of
 from .cut_surfaces import BEYOND, KINDS, STEEP, TURN, WITHIN, Kind, Surface, across, nearest, triangles, trim
 from .edges import Edges
 from .grids import is_grid
@@ -387,7 +388,7 @@ def _overlapping(geometry: Geometry) -> list[tuple[int, int]]:
     """Pairs of an analytic shape and another shape whose boxes overlap, by their numbers in `Geometry.moving`. Of two
     analytic shapes, the second is the one to divide."""
     meshes, analytic = geometry.meshes, geometry.analytic
-    boxes = np.array([(*b.min, *b.max) for b in (s.bbox() for s in (*meshes, *analytic))], np.float64)
+    boxes = np.array([(*b.min, *b.max) for b in (box_of(s) for s in (*meshes, *analytic))], np.float64)
     size = np.linalg.norm(boxes[:, 3:] - boxes[:, :3], axis=1)
     boxes[[*(is_grid(m) for m in meshes), *(False for _ in analytic)]] = np.nan  # which overlap nothing
     found = []

@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .boxes import box_of
 from .device_edges import rounding
 from .edges import WHOLE, EdgeKind, Edges, Weld, distinct_rows
 from .grids import is_grid
@@ -382,7 +383,7 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
     with others, (2, 3)."""
     if len(geometry.meshes) < 2:
         return {}
-    boxes = np.array([(*b.min, *b.max) for b in (m.bbox() for m in geometry.meshes)], float)
+    boxes = np.array([(*b.min, *b.max) for b in (box_of(m) for m in geometry.meshes)], float)
     boxes[[is_grid(m) for m in geometry.meshes]] = np.nan  # which overlap nothing
     lower, upper = boxes[:, :3], boxes[:, 3:]
     overlap = (lower[:, None] <= upper).all(2)

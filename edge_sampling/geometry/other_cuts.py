@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .boxes import box_of
 from .device_edges import rounding
 from .grids import grids_of
 from .meshes import Geometry, faces, is_met, number_of, vertices
@@ -82,7 +83,7 @@ def cuts_of_others(scene: mi.Scene, geometry: Geometry) -> list[tuple[mi.Shape, 
             ray = mi.Ray3f(point(a), mi.Vector3f(point((b - a) / length[:, None])))
             ray.maxt = mi.Float(np.float32(length))
             met = scene.ray_intersect_preliminary(ray)
-            others = [s for s in geometry.others if shape.bbox().overlaps(s.bbox())]
+            others = [s for s in geometry.others if box_of(shape).overlaps(box_of(s))]
             found += [(shape, s) for s in others if dr.any(met.is_valid() & is_met(met, mi.ShapePtr(s)))[0]]
     return found
 

@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from .beams import BEAMS, ROUNDING, BeamBorder, has_hard_beam, on_texture
+from .boxes import box_around
 from .mapped_horizons import mapped_horizons
 from .meshes import (
     Geometry,
@@ -253,7 +254,7 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
     # A scene file may define materials, or wrap them, that no shape refers to.
     used = below((*surfaces(scene), *scene.emitters()))
     known = [k for k, o in below(besides).items() if o.class_name() != VOLUME]
-    box = scene.bbox()
+    box = box_around(scene)
     uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if has_texcoords(m)]
     uv = np.concatenate([np.zeros((0, 2)), *uv])
     return [

@@ -10,8 +10,11 @@ from scipy.optimize import brentq
 #: Derivatives from which the noise of each term is measured.
 RUNS = 4
 
-#: The least share, and its reciprocal the largest: measured noise may lack what is rare.
+#: The least share: measured noise may lack what is rare.
 LEAST = 1 / 2
+
+#: The largest share: costs are reckoned, and not measured.
+MOST = 8
 
 
 @dataclass(frozen=True)
@@ -66,9 +69,9 @@ def balanced(images: dict[str, np.ndarray], cost: dict[str, float], fixed: set[s
     costs = np.array([cost[name] for name in free])
     shares = np.ones(len(free))
     if np.isfinite(wanted).all() and wanted.any():
-        clipped = lambda scale: np.clip(scale * wanted, LEAST, 1 / LEAST)
+        clipped = lambda scale: np.clip(scale * wanted, LEAST, MOST)
         more = lambda scale: costs @ clipped(scale) - costs.sum()
-        largest = 1 / (LEAST * wanted[wanted > 0].min())
+        largest = MOST / wanted[wanted > 0].min()
         shares = clipped(brentq(more, 0, largest) if more(largest) > 0 else largest)
     found = dict(zip(free, map(float, shares), strict=True))
     return Balance(noise, cost, {name: found.get(name, 1.0) for name, c in cost.items() if c > 0})

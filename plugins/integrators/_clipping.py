@@ -9,6 +9,7 @@ import numpy as np
 
 from rimlight._plan import listed, names
 from rimlight.edge_sampling import film_parts
+from rimlight.edge_sampling.geometry.boxes import box_of
 from rimlight.edge_sampling.geometry.meshes import vertices
 from rimlight.edge_sampling.geometry.tubes import TUBE
 
@@ -40,7 +41,7 @@ def cut_by_planes(sensor: mi.Sensor, shapes: list[mi.Shape]) -> list[str]:
 
 def _crosses(shape: mi.Shape, axis: np.ndarray, depth: float) -> bool:
     """Are there points of a shape on both sides of a plane? axis : (4,), maps points to depths."""
-    box = shape.bbox()
+    box = box_of(shape)
     bounds = np.stack([np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()])
     corners = np.stack(np.meshgrid(*bounds.T), -1).reshape(-1, 3)
     sides = corners @ axis[:3] + axis[3] > depth

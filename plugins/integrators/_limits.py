@@ -20,6 +20,7 @@ from rimlight.edge_sampling import (
 )
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
+from rimlight.edge_sampling.geometry.boxes import box_of
 from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, inner, lets_rays_through, surfaces, vertices
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others, cuts_of_tubes
@@ -188,7 +189,7 @@ def shut_in_lamps(scene: mi.Scene, moving: Moving) -> list[str]:
     lamps = [s for s in moving.shapes if s.is_emitter()]
     lets_light_through = mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission
     bulbs = [s for s in surfaces(scene) if s.bsdf() is not None and s.bsdf().flags() & lets_light_through]
-    shut_in = [(lamp, bulb) for bulb in bulbs for lamp in lamps if lamp != bulb and bulb.bbox().contains(lamp.bbox())]
+    shut_in = [(lamp, bulb) for bulb in bulbs for lamp in lamps if lamp != bulb and box_of(bulb).contains(box_of(lamp))]
     return [
         f"with respect to the place of {names([lamp])[0]}, the derivative lacks all that its light does behind the "
         f"smooth glass of {names([bulb])[0]}, in which it is: it may be 0. Give the glass a roughness, or leave it out."
@@ -410,12 +411,11 @@ class Media:
         """
         for name, medium in self.found.items():
             params = mi.traverse(medium)
-            for key in params.properties:
-                if dr.grad_enabled(params[key]):
-                    raise Refusal(
-                        f'{who}: "{name}.{key}" ({medium.class_name()}) carries a gradient, but participating media '
-                        "are not supported. Detach it, or use Mitsuba's prbvolpath."
-                    )
+            for key in [k for k in params.properties if dr.grad_enabled(params[k])]:
+                raise Refusal(
+                    f'{who}: "{name}.{key}" ({medium.class_name()}) carries a gradient, but participating media '
+                    "are not supported. Detach it, or use Mitsuba's prbvolpath."
+                )
 
 
 def refuse_timed_sky(scene: mi.Scene, who: str) -> None:

@@ -19,7 +19,7 @@ from .term import Job
 class DeepShadowsTerm(FromPoints):
     """Edges as vertices of light subpaths see them."""
 
-    name, effort, beyond = "shadows in light from surfaces", 2.5, 1
+    name, effort, beyond = "shadows in light from surfaces", 3.0, 1
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0

@@ -18,7 +18,7 @@ from .term import Job
 class HorizonsTerm(FromPoints):
     """What coarse smooth-shaded meshes cease to reflect to points, where their normals turn away from these."""
 
-    name, effort, beyond = "horizons from points", 2.5, 1
+    name, effort, beyond = "horizons from points", 3.0, 1
 
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) is not None else 0

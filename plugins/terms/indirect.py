@@ -19,7 +19,7 @@ from .term import Job
 class IndirectShadowsTerm(FromPoints):
     """Edges as the lights see them, and lines of beams, by what jumps there on what lights the vertices of paths."""
 
-    name, effort, beyond = "shadows in indirect light", 2.5, 1
+    name, effort, beyond = "shadows in indirect light", 3.0, 1
 
     def planned(self, job: Job) -> PlannedTerm:
         found = self.boundary(job)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.geometry.boxes import box_around
 from rimlight.edge_sampling.rays import spawn_ray
 
 from .found_light import LightEnd
@@ -32,12 +33,12 @@ class LightSample:
 
 
 class Around:
-    """A sphere around a scene, as large as Mitsuba's, or a little larger."""
+    """A sphere around a scene, a little larger than the one around its box."""
 
     DRJIT_STRUCT = dict.fromkeys(("centre", "radius"))  # for `dr.freeze`
 
     def __init__(self, scene: mi.Scene):
-        box = scene.bbox()
+        box = box_around(scene)
         sphere = box.bounding_sphere() if box.valid() else None
         self.centre = mi.Point3f(sphere.center if sphere else 0)
         # Rays start outside of everything that they may meet.
