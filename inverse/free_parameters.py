@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
@@ -14,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight._plan import no_parameter
 from rimlight.edge_sampling.geometry.meshes import (
     as_parameter,
     faces_of_positions,
@@ -303,10 +303,7 @@ def _check_free_once(entry: Free, rigid: Iterable[str], found: Iterable[Paramete
 def check_key(key: str, params: Any, who: str = "fit") -> None:
     """InputError : the scene has no such parameter, or it has no derivative. who : speaks in the message."""
     if key not in params:
-        close = difflib.get_close_matches(key, list(params.keys()), n=3, cutoff=0.4)
-        raise InputError(
-            f'{who}: the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
-        )
+        raise InputError(f"{who}: {no_parameter(params, key)}")
     value = params[key]
     if not is_transform(value) and not (dr.is_diff_v(value) and dr.is_float_v(value)):
         raise InputError(f'{who}: "{key}" is of type {type(value).__name__}, which has no derivative')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -106,7 +107,7 @@ def plan(
     keys, known = list(params), mi.traverse(scene)
     unknown = [k for k in keys if k not in known]
     if unknown:
-        raise InputError(f"plan: unknown parameter {', '.join(unknown)}")
+        raise InputError("plan: " + no_parameter(known, unknown[0]))
     # Copies, since `known` hands out what the scene itself holds. Where positions are set, Mitsuba makes normals anew.
     copy = lambda names: {k: type(known[k])(known[k]) for k in names if k in known}
     before, normals = copy(keys), copy(k.removesuffix("positions") + "normals" for k in keys if is_positions_key(k))
@@ -121,6 +122,19 @@ def plan(
             for k, value in values.items():
                 known[k] = value
             known.update()
+
+
+def no_parameter(known: mi.SceneParameters, key: str) -> str:
+    """A message: the scene has no such parameter, but these that are like it, and why it may be gone."""
+    keys = list(known.keys())
+    close = difflib.get_close_matches(key, keys, n=3, cutoff=0.4)
+    message = f'the scene has no parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else "")
+    if any(k.startswith("object_") for k in keys):
+        message += (
+            ' What has no "id" is named by its address. Mitsuba makes one mesh of all those with equal materials, '
+            "whose ids are lost, unless the scene is loaded with optimize=False."
+        )
+    return message
 
 
 def counted(number: int, what: str) -> str:

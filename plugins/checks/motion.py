@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 
 import drjit as dr
@@ -10,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import no_collection
+from rimlight._plan import no_parameter
 from rimlight.edge_sampling.geometry.meshes import is_positions_key, present_key
 from rimlight.edge_sampling.refusals import InputError
 
@@ -50,8 +50,7 @@ class Motion:
         self.params = mi.traverse(scene)
         key = present_key(self.params, key)
         if key not in self.params:
-            close = difflib.get_close_matches(key, list(self.params.keys()), n=3, cutoff=0.4)
-            raise InputError(f'unknown parameter "{key}"' + (f", did you mean {' or '.join(close)}?" if close else ""))
+            raise InputError(no_parameter(self.params, key))
         if (direction is None) == (rotate is None):
             raise InputError(f'"{key}": give either a direction or an axis to rotate about')
         value = self.params[key]

@@ -5,8 +5,10 @@ from __future__ import annotations
 import cases
 import mitsuba as mi
 import numpy as np
+import pytest
 from invariance import difference
 
+import rimlight
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling.geometry.boxes import box_around, box_of
 
@@ -75,3 +77,10 @@ def test_light_paths_reach_all(variant):
     )
     ours, theirs = (np.array([render(kind, 10 * i + s) for s in range(4)]) for i, kind in enumerate(("bdpt", "path")))
     assert not difference(ours, theirs).faults(noise=0.1)
+
+
+def test_messages_tell_where_names_have_gone(variant):
+    with pytest.raises(ValueError, match=r'no parameter "floor\.vertex_positions", .*did you mean .*optimize=False'):
+        Motion(room(True), "floor.vertex_positions", direction=[1, 0, 0])
+    with pytest.raises(ValueError, match=r'plan: .* "cubes\.vertex_positions", did you mean cube'):
+        rimlight.plan(room(False), ["cubes.vertex_positions"])
