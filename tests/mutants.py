@@ -191,6 +191,7 @@ MUTANTS = [
         "shadow.active &= self._hidden_below(tracer.scene, light, edge, shadow)",
         "pass",
     ),
+    mutant("boxes: of merged meshes, unset", "edge_sampling/geometry/boxes.py", "shape.recompute_bbox()", "pass"),
     mutant("tree of edges: not refitted", FOUND, "self.silhouettes.refit()", "pass"),
     mutant("edges: never found again", SEARCH, "        if same:\n", "        if self._sources is not None:\n"),
     mutant(
