@@ -16,8 +16,6 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from .geometry.boxes import box_around
-
 #: Largest offset in small scenes, relative to their diagonal, in RayEpsilon.
 PART = 0.25
 
@@ -107,7 +105,7 @@ def _start(scene, si, d) -> mi.Point3f:
 
 def extent(scene: mi.Scene) -> tuple[float, float]:
     """Diagonal of the box around a scene, and its largest coordinate: infinity and zero, if there is no such box."""
-    box = box_around(scene)
+    box = scene.bbox()
     lower, upper = list(box.min), list(box.max)
     reach = max(map(abs, lower + upper))
     return (math.dist(lower, upper), reach) if box.valid() and math.isfinite(reach) else (math.inf, 0.0)

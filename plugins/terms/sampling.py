@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.projection.sensors import sampled_border
 from rimlight.edge_sampling.refusals import Refusal
 
 #: What the seed of a call is changed by for each term (exclusive or), so that no two share their random numbers. The
@@ -86,7 +85,7 @@ class Counts:
 
 def size(film: mi.Film) -> tuple[int, int]:
     """Width and height of what is sampled, in pixels."""
-    border = 2 * sampled_border(film)
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
     return tuple(int(n) + border for n in film.crop_size())
 
 
