@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 
 def box_of(shape: Any) -> mi.ScalarBoundingBox3f:
     """The box around a shape, which is set if it is not yet. Then, it reads from the device."""
     box = shape.bbox()
-    if not box.valid() and isinstance(shape, mi.Mesh) and not dr.flag(dr.JitFlag.FreezingScope):
+    if not box.valid() and isinstance(shape, mi.Mesh):
         shape.recompute_bbox()
         box = shape.bbox()
     return box

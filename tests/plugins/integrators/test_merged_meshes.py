@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cases
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -11,8 +14,6 @@ from invariance import difference
 import rimlight
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling.geometry.boxes import box_around, box_of
-
-RUNS = 8
 
 
 def room(merged: bool, **more) -> mi.Scene:
@@ -43,29 +44,21 @@ def test_boxes(variant):
     assert all(box_of(shape).valid() for shape in merged.shapes())
 
 
+def sinking(merged: bool, runs: int) -> tuple[np.ndarray, Any]:
+    """Derivatives of the cube's sinking, and the integrator. It has been used before the cube came to where it is."""
+    scene, integrator = room(merged), mi.load_dict({"type": "direct_edge"})
+    for height in (0, -0.02):
+        Motion(scene, "cube.vertex_positions", direction=[0, 1, 0]).apply(height)
+        motion = Motion(scene, "cube.vertex_positions", direction=[0, -1, 0])
+        images = [derivative_image(scene, integrator, motion, spp=64, seed=i) for i in range(runs if height else 1)]
+    return np.array(images, float), integrator
+
+
 def test_lines_are_found_after_a_move(variant):
     """Where a rigid motion follows the first search, only what is in overlapping boxes is looked at again."""
-    counts = []
-    for merged in (True, False):
-        scene, integrator = room(merged), mi.load_dict({"type": "direct_edge"})
-        for height in (0, -0.02):
-            Motion(scene, "cube.vertex_positions", direction=[0, 1, 0]).apply(height)
-            derivative_image(scene, integrator, Motion(scene, "cube.vertex_positions", direction=[0, 1, 0]), spp=1)
-        counts.append(integrator.search._lines.count)
-    assert counts[0] == counts[1] > 4
-
-
-def test_derivatives(variant):
-    """The cube sinks: all that changes is where the floor cuts it off."""
-    images = []
-    for merged in (True, False):
-        scene, integrator = room(merged), mi.load_dict({"type": "direct_edge"})
-        for height in (0, -0.02):
-            Motion(scene, "cube.vertex_positions", direction=[0, 1, 0]).apply(height)
-            motion = Motion(scene, "cube.vertex_positions", direction=[0, -1, 0])
-            made = [derivative_image(scene, integrator, motion, spp=64, seed=i) for i in range(RUNS if height else 1)]
-        images.append(np.array(made, float))
-    assert not difference(*images, tolerance=0.01).faults(noise=0.1)
+    (merged, a), (apart, b) = (sinking(m, runs=8) for m in (True, False))
+    assert a.search._lines.count == b.search._lines.count > 4
+    assert not difference(merged, apart, tolerance=0.01).faults(noise=0.1)
 
 
 def test_light_paths_reach_all(variant):
@@ -77,6 +70,15 @@ def test_light_paths_reach_all(variant):
     )
     ours, theirs = (np.array([render(kind, 10 * i + s) for s in range(4)]) for i, kind in enumerate(("bdpt", "path")))
     assert not difference(ours, theirs).faults(noise=0.1)
+
+
+def test_light_paths_reach_all_in_frozen_functions(variant):
+    """Also if the first thing that is done with a scene is recorded."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
+    render = lambda scene, seed: mi.render(scene, integrator=integrator, spp=16, seed=seed)
+    scene = room(True)
+    frozen = np.array(dr.freeze(render)(scene, mi.UInt32(1)))
+    np.testing.assert_allclose(frozen, np.array(render(scene, 1)), rtol=1e-4)
 
 
 def test_messages_tell_where_names_have_gone(variant):
