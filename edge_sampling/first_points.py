@@ -2,8 +2,9 @@
 
 As a rule, the film position of a camera ray is held, and what it meets slides over its surface. Of a fine texture, or
 fine bumps, it then meets something else at once: the derivative is large, of either sign, and means little to a pixel
-that is wider than they are. So points x of such surfaces are held, and their film position u(x) moves. With the film
-area J = |du/dA| of an element of the surface, the value of a pixel with the filter k is
+that is wider than they are. And of a curved shape that is polished, it meets another normal: what a mirror or glass
+shows moves many times as fast as the shape. So points x of such surfaces are held, and their film position u(x) moves.
+With the film area J = |du/dA| of an element of the surface, the value of a pixel with the filter k is
 
     I = ∫ k(u(x)) L(x) J dA,      dI = ∫ k(u) (dL + L dJ/J) du  +  ∫ L ∇k · u̇ du.
 

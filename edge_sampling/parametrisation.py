@@ -5,7 +5,8 @@ it: what the interior term holds fixed is what the sides of a boundary move with
 
 ====================================  ======================================================================
 what the camera sees                  the film position: the *ray* is fixed on the film, and moves with the camera;
-                                      of fine textures, the *material point* (`first_points.py`)
+                                      of fine textures, and of polished curved shapes, the *material point*
+                                      (`first_points.py`)
 every further vertex of a path        far from the vertex before: the *material point*, which follows its surface;
                                       close to it, or behind rough glass: the direction, so that the vertex
                                       slides over its surface

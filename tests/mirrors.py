@@ -9,7 +9,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
-from random_scenes import ball, tetrahedron
+from random_scenes import ball, grid, tetrahedron
+from scipy.interpolate import PchipInterpolator
 
 
 def cube(centre=(0.1, 0.7, 0.1), size: float = 0.4, **props: Any) -> mi.Mesh:
@@ -69,6 +70,30 @@ def glass_ball(bsdf: dict | None = None) -> mi.Scene:
     """A ball of glass before a bar that shines."""
     bsdf = bsdf or {"type": "dielectric"}
     return before_bar({"type": "sphere", "center": [0, 0.4, -0.4], "radius": 0.6, "bsdf": bsdf})
+
+
+#: Half of a cross-section of a wine glass, from the middle of its foot to the bottom of the bowl: radius and height.
+STEM = ((0, 0), (0.34, 0), (0.36, 0.015), (0.34, 0.03), (0.1, 0.06), (0.035, 0.14), (0.03, 0.3), (0.035, 0.42))
+BOWL = ((0.12, 0.5), (0.27, 0.62), (0.34, 0.78), (0.33, 0.95), (0.29, 1.1), (0.277, 1.11), (0.265, 1.1))
+INSIDE = ((0.305, 0.95), (0.315, 0.78), (0.245, 0.635), (0.1, 0.535), (0, 0.52))
+
+
+def wine_glass() -> mi.Scene:
+    """One of 8,000 smooth triangles, before a bar that shines, on a floor that does."""
+    outline = np.array([*STEM, *BOWL, *INSIDE])
+    along = np.cumsum([0, *np.linalg.norm(np.diff(outline, axis=0), axis=1)])
+    curve = PchipInterpolator(along / along[-1], outline)
+
+    def point(φ, v):
+        (r, y), (dr, dy) = curve(v).T, curve(v, 1).T
+        turned = lambda radius, height: np.stack([radius * np.cos(φ), height, radius * np.sin(φ)], 1)
+        return turned(r, y), turned(dy, -dr)
+
+    vertices, _, _, faces = grid(point, 64, 64)
+    glass = mesh("ball", vertices + np.array([0, -0.15, -0.3]), faces, normals=True, bsdf={"type": "dielectric"})
+    floor = horizontal((0, -0.16, 0), 2, "floor", bsdf=diffuse(0.0), emitter=light(0.5, 0.4, 0.3))
+    at = camera((0.4, 0.9, -3.2), (0, 0.4, 0), fov=28)
+    return scene(sensor=at, ball=glass, bar=bar((0.15, 0.65, 0.9)), floor=floor, sky=constant(0.3))
 
 
 def ball_of_index() -> mi.Scene:
@@ -315,6 +340,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),
     "glass_ball_camera": (glass_ball, CAMERA, 1e-3, 6),
+    "wine_glass": (wine_glass, MESH, 1e-3, 8),
     "mirrored_ball": (mirrored_ball, BALL, 2e-3, 3),
     "smooth_mirror": (smooth_mirror, MESH, 2e-3, 3),
     "shadow_in_mirror": (shadow_in_wall, SLIDE, 4e-3, 3),

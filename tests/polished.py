@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
+from random_scenes import ball
 
 
 def metal(alpha: float) -> dict:
@@ -74,12 +75,28 @@ def caustic() -> mi.Scene:
     )
 
 
+def balls() -> mi.Scene:
+    """Two polished balls, a sphere and a mesh, which show a lamp, a matt floor and each other."""
+    vertices, _, _, faces = ball(16)
+    lamp = quad((-0.6, 1.2, -1.2), (1.2, 0, 0), (0, 0.5, 0.5), "lamp", bsdf=diffuse(0.0), emitter=light(6, 5, 4))
+    figure = 0.35 * vertices + np.array([-0.45, 0.4, 0])
+    return scene(
+        sensor=camera((0.3, 1.2, -2.2), (0, 0.3, 0)),
+        floor=horizontal((0, -0.1, 0), 1.5, "floor", bsdf=diffuse(0.5)),
+        sphere={"type": "sphere", "center": [0.45, 0.45, 0.1], "radius": 0.4, "bsdf": metal(0.05)},
+        figure=mesh("figure", figure, faces, normals=True, bsdf=lacquer(0.05)),
+        lamp=lamp,
+    )
+
+
 CAMERA_ALONG = {"key": "sensor.to_world", "direction": [1, 0, 0]}
 CAMERA_TURNS = {"key": "sensor.to_world", "rotate": [0, 1, 0]}
 FLOOR_RISES = {"key": "floor.vertex_positions", "direction": [0, 1, 0]}
 FLOOR_TILTS = {"key": "floor.vertex_positions", "rotate": [0.2, 0, 1]}
 LAMP_ALONG = {"key": "lamp.vertex_positions", "direction": [1, 0.3, 0]}
 CUBE_TURNS = {"key": "cube.vertex_positions", "rotate": [0, 1, 0]}
+SPHERE_SLIDES = {"key": "sphere.to_world", "direction": [1, 0.3, 0.4]}
+FIGURE_SLIDES = {"key": "figure.vertex_positions", "direction": [1, 0.3, 0.4]}
 WALL_TILTS = {"key": "wall.vertex_positions", "rotate": [0.3, 1, 0]}
 
 #: Of each case: scene, motion, step, longest path.
@@ -92,4 +109,7 @@ POLISHED = {
     "polished_rises": (wall, FLOOR_RISES, 3e-3, 3),
     "polished_sky": (sky, CAMERA_ALONG, 5e-3, 2),
     "lacquer_camera": (table, CAMERA_ALONG, 5e-3, 2),
+    "polished_sphere": (balls, SPHERE_SLIDES, 4e-3, 2),
+    "polished_figure": (balls, FIGURE_SLIDES, 4e-3, 2),
+    "balls_camera": (balls, CAMERA_ALONG, 4e-3, 3),
 }

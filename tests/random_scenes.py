@@ -62,6 +62,7 @@ SPECIAL = {
     "meshes": "things are torn, turned round, cut through themselves, or one of many faces (`random_meshes.py`)",
     "polished": "most surfaces are polished: their highlights are narrow",
     "textures": "nearly everything has textures, most of them fine (`random_textures.py`)",
+    "files": "meshes are files that share materials, loaded as Mitsuba does by default (`random_files.py`)",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
@@ -661,6 +662,8 @@ def make(seed: int, sampler: str = "independent", home: bool = False, special: s
         from random_mirrors import MirrorGenerator as Kind
     elif special == "meshes":
         from random_meshes import MeshGenerator as Kind
+    elif special == "files":
+        from random_files import FileGenerator as Kind
     elif special == "textures":
         from random_textures import TextureGenerator as Kind
     else:

@@ -53,6 +53,7 @@ from rimlight.edge_sampling.geometry.texture_edges import TextureEdges
 from rimlight.edge_sampling.geometry.texture_lines import looked_at_once
 from rimlight.edge_sampling.parametrisation import Slides, slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
+from rimlight.edge_sampling.turning_lobes import is_curved, turning_lobes
 from rimlight.transport.paths import Depths
 
 from ._clipping import cut_by_clipping_planes
@@ -84,7 +85,7 @@ class BoundarySearch:
 
     def __init__(self, who: str, depths: Depths, *, planes: bool, from_points: bool, from_surfaces: bool):
         self.who, self.depths, self.planes = who, depths, planes
-        #: May points of fine textures be held, as the first sensor sees them?
+        #: May points of fine textures, and of polished curved shapes, be held, as the first sensor sees them?
         self.holds = False
         self.from_points, self.from_surfaces = from_points, from_surfaces
         self.geometry: Geometry | None = None
@@ -326,21 +327,20 @@ class BoundarySearch:
         return self.holds and can_hold(sensor) and not self.geometry.others
 
     def _held(self, scene: mi.Scene, sensor: mi.Sensor, moving: Moving) -> HeldShapes | None:
-        """The shapes whose points are held where the camera sees them, since they have fine textures. Found as the
-        sensor of that moment sees them, and again when their textures have changed: see `Looks`."""
+        """The shapes whose points are held where the camera sees them, since they have fine textures, or are curved
+        and polished. Found as the sensor of that moment sees them, and again when their textures have changed: see
+        `Looks`."""
         if not self._may_hold(sensor):
             return None
         key = moving.camera, moving.flags
         count, held = self._fine.get(key, (-1, None))
         if count != self._looks.count and not dr.flag(dr.JitFlag.FreezingScope):
             shapes = surfaces(scene) if moving.camera else dict.fromkeys(inner(s) for s in moving.shapes)
-            rough = [
-                s
-                for s in shapes
-                if has_points(s) and s.bsdf() is not None and not is_mirror(s) and not lets_rays_through(s)
-            ]
+            shapes = [s for s in shapes if has_points(s) and s.bsdf() is not None and not lets_rays_through(s)]
+            rough = [s for s in shapes if not is_mirror(s)]
             as_edges = [inner(self.geometry.meshes[i]) for i in self._textures_on_film(moving, [])]
             fine = fine_textures(scene, sensor, rough, as_edges)
+            fine += turning_lobes(scene, sensor, [s for s in shapes if s not in fine and is_curved(s)])
             if fine != (held.shapes if held is not None else []):
                 held = HeldShapes(scene, fine) if fine else None
             self._fine[key] = self._looks.count, held

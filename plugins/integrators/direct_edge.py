@@ -24,8 +24,8 @@ class DirectEdgeIntegrator(EdgeIntegrator):
      * - sppp
        - |int|
        - Samples per pixel of the film boundary (visibility as seen from the sensor); likewise, but without a number
-         in the scene at most 16 (width + height) for each sample per pixel. And of fine textures that move over the
-         film, without that limit.
+         in the scene at most 16 (width + height) for each sample per pixel. And of fine textures, and of polished
+         curved shapes, that move over the film, without that limit.
 
      * - sppi
        - |int|

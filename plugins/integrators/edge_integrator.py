@@ -71,7 +71,7 @@ class EdgeIntegrator(ADIntegrator):
     #: And as vertices of light subpaths see them?
     FROM_SURFACES = False
 
-    #: May points of fine textures be held where the camera sees them?
+    #: May points of fine textures, and of polished curved shapes, be held where the camera sees them?
     HOLDS = False
 
     #: Can samples be divided among its terms, see `balance`?

@@ -19,6 +19,9 @@ from .term import FilmSamples, Job, Sample, Term
 #: Steps in which a reconstruction filter is tabulated, to choose places from: of its radius.
 STEPS = 64
 
+#: What passes, in plans.
+WHAT = "fine textures, or polished curved shapes, move over the film"
+
 #: Between which the slope of a filter is measured, pixels.
 BESIDE = 2**-9
 
@@ -40,7 +43,7 @@ class PassingTerm(Term):
         if makers:
             width, height = film.crop_size()
             count = 2 * each_way(job) * width * height + (makers > 1) * 2 * sum(size(film)) * job.counts.film
-        return self.plan(count, 2 * job.rays_of_path, "fine textures move over the film", "no fine texture does that")
+        return self.plan(count, 2 * job.rays_of_path, WHAT, "none does that")
 
     def samples(self, job: Job) -> list[Callable[[], FilmSamples]]:
         if job.tracer.held is None:

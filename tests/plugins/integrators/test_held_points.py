@@ -7,15 +7,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from both_modes import assert_backward_is_forward
+from building import camera, mesh, scene
 from cases import CAMERA_X, case, diffuse
 from fine_textures import TEXELS, bitmap, fine, stage
 from frozen import Step, assert_same, losses_and_gradients, numbers, one_thread
 from instances import stretched_ball
+from polished import lacquer, metal
+from random_scenes import ball
 
 import rimlight
 from rimlight.checks import FiniteDifferences, Motion, compare, derivative_image
 from rimlight.edge_sampling.fine_textures import Looks
 from rimlight.edge_sampling.geometry.parameters import parameters
+from rimlight.edge_sampling.turning_lobes import turning_lobes
 
 
 def held(scene, integrator, key="sensor.to_world"):
@@ -137,7 +141,45 @@ def test_what_is_not_held(variant, what):
     assert held(stage(floor=floors.get(what, fine), **view)(), mi.load_dict(integrator)) == []
 
 
-@pytest.mark.parametrize("name", ["fine_look", "fine_lens", "fine_wall", "fine_box"])
+def rounded(bsdf, flat=False):
+    """A mesh of few faces with the normals of a ball; or with those of its faces."""
+    vertices, _, _, faces = ball(8)
+    return scene(sensor=camera((0, 0, -4)), thing=mesh("thing", vertices, faces, normals=not flat, bsdf=bsdf))
+
+
+@pytest.mark.parametrize(
+    "bsdf, flat, is_held",
+    [
+        ({"type": "conductor"}, False, True),
+        ({"type": "dielectric"}, False, True),
+        ({"type": "conductor"}, True, False),
+        (metal(0.05), False, True),
+        (lacquer(0.05), False, True),
+        (metal(0.05), True, False),
+        (metal(0.5), False, False),
+        (diffuse(0.5), False, False),
+    ],
+)
+def test_curved_shapes_are_held_if_they_are_polished(variant, bsdf, flat, is_held):
+    made, integrator = rounded(bsdf, flat), mi.load_dict({"type": "direct_edge"})
+    assert held(made, integrator, "thing.vertex_positions") == ["thing"] * is_held
+
+
+@pytest.mark.parametrize("name", ["glass_ball", "polished_sphere"])
+def test_polished_shapes_that_are_held_have_less_noise(variant, monkeypatch, name):
+    c, noise = case(name), []
+    motion = lambda scene: Motion(scene, **c.motion)
+    for chosen in (turning_lobes, lambda *_: []):
+        monkeypatch.setattr("rimlight.integrators._search.turning_lobes", chosen)
+        made, integrator = c.scene(), mi.load_dict(c.integrator)
+        images = [derivative_image(made, integrator, motion(made), spp=32, seed=i) for i in range(6)]
+        noise.append(np.array(images, float).std(0, ddof=1).sum())
+    assert noise[0] < 0.75 * noise[1]
+
+
+@pytest.mark.parametrize(
+    "name", ["fine_look", "fine_lens", "fine_wall", "fine_box", "glass_ball", "polished_figure", "balls_camera"]
+)
 def test_backward_is_forward(variant, name):
     c = case(name)
     scene = c.scene()
@@ -162,7 +204,7 @@ def test_plans_tell(variant):
         plan = rimlight.plan(stage(floor=floor)(), ["sensor.to_world"], integrator=integrator)
         rows[floor is fine] = plan.term("passing surfaces")
     assert rows[True].samples > 0 and rows[False].samples == 0
-    assert "fine textures move over the film" in rows[True].reason and "no fine texture" in rows[False].reason
+    assert "fine textures" in rows[True].reason and rows[False].reason == "none does that"
 
 
 @pytest.mark.parametrize("rfilter", ["box", "tent", "gaussian", "mitchell", "lanczos"])
