@@ -165,7 +165,7 @@ def test_curved_shapes_are_held_if_they_are_polished(variant, bsdf, flat, is_hel
     assert held(made, integrator, "thing.vertex_positions") == ["thing"] * is_held
 
 
-@pytest.mark.parametrize("name", ["glass_ball", "polished_sphere"])
+@pytest.mark.parametrize("name", ["glass_ball", "balls_camera"])
 def test_polished_shapes_that_are_held_have_less_noise(variant, monkeypatch, name):
     c, noise = case(name), []
     motion = lambda scene: Motion(scene, **c.motion)
