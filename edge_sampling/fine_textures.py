@@ -121,7 +121,8 @@ def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.
             own = si.emitter(scene) == mi.EmitterPtr(emitter)
             seen += dr.select(own, mi.unpolarized_spectrum(emitter.eval(si, own)), 0)
         values.append(dr.mean(seen))
-    near, far = (dr.abs(v - values[0]) for v in values[1:])
+    # At the outline of what is round, a pixel is long: without these weights, it is chance what the sums are.
+    near, far = (dr.abs((v - values[0]) * dr.dot(n, ray.d)) for v in values[1:])
     near = dr.select(near > ROUNDING * dr.epsilon(mi.Float) * dr.abs(values[0]), near, 0) / STEP
     shape = dr.reinterpret_array(mi.UInt32, si.shape)
     usable = si.is_valid() & dr.isfinite(near) & dr.isfinite(far)
