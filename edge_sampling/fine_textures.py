@@ -90,20 +90,22 @@ def _varies(owner: mi.Object) -> bool:
     return bool(textures) and not (bumpy and any(not o.class_name().startswith("Bitmap") for o in textures))
 
 
-def look(sensor: mi.Sensor) -> tuple[mi.Sampler, mi.RayDifferential3f, mi.Bool]:
-    """Random numbers, rays through anywhere on the film, and for each along which of its axes to look on."""
+def look(sensor: mi.Sensor) -> tuple[mi.Sampler, mi.Point2f, mi.RayDifferential3f, mi.Bool]:
+    """Random numbers, two of them for directions, rays through anywhere on the film, and for each along which of its
+    axes to look on."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, RAYS)
     wavelength, along_x = sampler.next_1d(), sampler.next_1d() < 0.5
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), wavelength, sampler.next_2d(), sampler.next_2d())
-    return sampler, ray, along_x
+    lens, direction, position = sampler.next_2d(), sampler.next_2d(), sampler.next_2d()
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), wavelength, position, lens)
+    return sampler, direction, ray, along_x
 
 
 def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """At many positions on the film, how much what is seen of some shapes changes per pixel, over a short step, and
     over a whole pixel of its texture; and the number of the shape."""
-    sampler, ray, along_x = look(sensor)
-    towards = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    _, direction, ray, along_x = look(sensor)
+    towards = mi.warp.square_to_cosine_hemisphere(direction)
     si = scene.ray_intersect(ray, mi.RayFlags.All, True)
     si.compute_uv_partials(ray)
     pixel = dr.select(along_x, si.duv_dx, si.duv_dy)

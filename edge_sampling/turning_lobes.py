@@ -49,7 +49,7 @@ def turning_lobes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list
 def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Of samples of the light that some shapes reflect, how much they change per pixel, as the normal does, where the
     shape is seen from its front; their values; and the number of the shape."""
-    sampler, ray, along_x = look(sensor)
+    sampler, direction, ray, along_x = look(sensor)
     si = Surfaces(scene).met(ray, scene.ray_intersect_preliminary(ray), mi.Bool(True))
     si.compute_uv_partials(ray)
     pixel = dr.select(along_x, si.duv_dx, si.duv_dy) * dr.abs(dr.dot(si.n, ray.d))
@@ -57,7 +57,7 @@ def _changes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> tuple[mi.
     turned.sh_frame = mi.Frame3f(dr.normalize(si.sh_frame.n + STEP * (si.dn_du * pixel.x + si.dn_dv * pixel.y)))
     turned.wi = turned.to_local(-ray.d)
     by_lobe, lobe, inside = sampler.next_1d() < 0.5, sampler.next_1d(), sampler.next_2d()
-    cosine = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    cosine = mi.warp.square_to_cosine_hemisphere(direction)
     cosine.z = dr.mulsign(cosine.z, si.wi.z)
     change, light, context = mi.Float(0), mi.Float(0), mi.BSDFContext()
     # Not by virtual function calls, which would ask all materials that there are, those of other scenes included.
