@@ -66,7 +66,7 @@ def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any], as_edge
     as_edges : shapes with lines that are edges on the film.
     """
     # Many shapes may share a material.
-    varies = cache(_varies)
+    varies = cache(has_texture)
     varying = [s for s in shapes if varies(s.bsdf()) or (s.is_emitter() and varies(s.emitter()))]
     if not varying:
         return []
@@ -82,7 +82,7 @@ def fine_textures(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any], as_edge
     return found
 
 
-def _varies(owner: mi.Object) -> bool:
+def has_texture(owner: mi.Object) -> bool:
     """Does a material, or an emitter, have a texture? (Mitsuba 3.9 has no bump maps of other textures than bitmaps.)"""
     below = objects_below(owner).values()
     textures = [o for o in below if isinstance(o, mi.Texture) and o.is_spatially_varying()]

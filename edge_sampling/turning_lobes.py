@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .fine_textures import look
+from .fine_textures import has_texture, look
 from .geometry.meshes import has_normal_map, inner, is_smooth
 from .geometry.surfaces import Surfaces
 
@@ -31,9 +31,11 @@ def is_curved(shape: Any) -> bool:
 
 def turning_lobes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list[Any]:
     """Those among some curved shapes that reflect and refract light in a lobe which turns away over a pixel, or in one
-    of no width, as perfect mirrors do. Looks at some thousand rays."""
-    found = [s for s in shapes if s.bsdf().flags() & SMOOTH]
-    others = [s for s in shapes if s not in found and s.bsdf().flags() & GLOSSY]
+    of no width, as perfect mirrors do, if these have no
+    texture. Looks at some thousand rays."""
+    # Of mirrors and glass with a texture, derivatives were wrong: the lines at which it jumps counted otherwise.
+    found = [s for s in shapes if s.bsdf().flags() & SMOOTH and not has_texture(s.bsdf())]
+    others = [s for s in shapes if not s.bsdf().flags() & SMOOTH and s.bsdf().flags() & GLOSSY]
     if not others:
         return found
     with dr.suspend_grad():

@@ -2,7 +2,7 @@
 
     python tests/random_scenes.py --special files --seeds 956000 956020
 
-Two or three materials are shared by the floor, the things and the lights. Meshes are read from PLY files, some of them
+Two or three materials are shared by the floor and the things. Meshes are read from PLY files, some of them
 with the vertex normals that Mitsuba computes for files without any. Mitsuba makes one mesh of all those that share a
 material; where one of them moves, a part of that mesh does.
 """
@@ -75,14 +75,14 @@ class FileGenerator(Generator):
         params = mi.traverse(scene)
         positions = {key: np.array(value).reshape(-1, 3) for key, value in params if key.endswith("vertex_positions")}
         #: Of the meshes of which a thing has become a part: whether each vertex is the thing's.
-        self.parts: dict[str, np.ndarray] = {}
+        self.parts: dict[tuple, np.ndarray] = {}
         things = []
         for key, how, centre in self.movable["thing"]:
             if key not in params:
                 reach = self.reach[key.split(".")[0]] * self.scale
                 near = {k: np.linalg.norm(p - self.place(centre), axis=1) < reach for k, p in positions.items()}
                 key = max(near, key=lambda k: near[k].sum())
-                self.parts[key], how = near[key], f"part {how}"
+                self.parts[(key, *centre)], how = near[key], f"part {how}"
             things.append((key, how, centre))
         self.movable["thing"] = things
         self.labels.append(f"{len(scene.shapes())} of {self.files()} shapes")
@@ -98,7 +98,7 @@ class FileGenerator(Generator):
         if not how.startswith("part"):
             return whole
         still = type(params[key])(params[key])
-        part = mi.Bool(np.repeat(self.parts[key], 3))
+        part = mi.Bool(np.repeat(self.parts[(key, *centre)], 3))
 
         def change(θ: mi.Float) -> None:
             whole(θ)

@@ -153,6 +153,7 @@ def rounded(bsdf, flat=False):
         ({"type": "conductor"}, False, True),
         ({"type": "dielectric"}, False, True),
         ({"type": "conductor"}, True, False),
+        ({"type": "conductor", "specular_reflectance": {"type": "checkerboard"}}, False, False),
         (metal(0.05), False, True),
         (lacquer(0.05), False, True),
         (metal(0.05), True, False),
