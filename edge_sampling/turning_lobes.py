@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .fine_textures import has_texture, look
+from .fine_textures import look
 from .geometry.meshes import has_normal_map, inner, is_smooth
 from .geometry.surfaces import Surfaces
 
@@ -24,17 +24,15 @@ RATE = 0.6
 
 
 def is_curved(shape: Any) -> bool:
-    """Do the normals of a shape turn along its surface, by themselves?"""
+    """Do the normals of a shape turn along its surface: by themselves, or, of perfect mirrors and glass, by a map?"""
     curved = is_smooth(shape) if shape.is_mesh() else shape.class_name() in ("Sphere", "Cylinder")
-    return curved and not has_normal_map(shape)
+    return curved or (bool(shape.bsdf().flags() & SMOOTH) and has_normal_map(shape))
 
 
 def turning_lobes(scene: mi.Scene, sensor: mi.Sensor, shapes: list[Any]) -> list[Any]:
     """Those among some curved shapes that reflect and refract light in a lobe which turns away over a pixel, or in one
-    of no width, as perfect mirrors do, if these have no
-    texture. Looks at some thousand rays."""
-    # Of mirrors and glass with a texture, derivatives were wrong: the lines at which it jumps counted otherwise.
-    found = [s for s in shapes if s.bsdf().flags() & SMOOTH and not has_texture(s.bsdf())]
+    of no width, as perfect mirrors do. Looks at some thousand rays."""
+    found = [s for s in shapes if s.bsdf().flags() & SMOOTH]
     others = [s for s in shapes if not s.bsdf().flags() & SMOOTH and s.bsdf().flags() & GLOSSY]
     if not others:
         return found

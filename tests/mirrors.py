@@ -245,6 +245,44 @@ def checkered_ball() -> mi.Scene:
     return scene(sensor=at, ball=thing, mirror=floor, sky=constant(0.4), lamp=lamp())
 
 
+def checkered(kind: str, mesh_: bool = True) -> mi.Scene:
+    """A ball under a sky, with a checkerboard of which lines lie along edges of its mesh, and one on its seam.
+
+    kind : mirror, lacquer, or milk glass.
+    """
+    pattern = {**checkers(scale=(4, 4), turned=0), "color1": {"type": "rgb", "value": [0.9, 0.8, 0.7]}}
+    bsdf = {
+        "mirror": {"type": "conductor", "specular_reflectance": pattern},
+        "lacquer": {"type": "plastic", "diffuse_reflectance": pattern},
+        "milk": {"type": "principled", "base_color": pattern, "spec_trans": 0.5, "roughness": 0.4},
+    }[kind]
+    if mesh_:
+        vertices, _, uv, faces = ball(10)
+        shape: Any = mesh("ball", 0.6 * vertices + [0, 0.4, 0.3], faces, normals=True, uv=uv, bsdf=bsdf)
+    else:
+        shape = {"type": "sphere", "id": "ball", "center": [0, 0.4, 0.3], "radius": 0.6, "bsdf": bsdf}
+    return scene(sensor=camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35), ball=shape, sky=constant(0.5))
+
+
+def pictured_globe() -> mi.Scene:
+    """A globe whose picture does not go on around it: its seam is seen."""
+    picture = np.linspace(0.1, 1, 8, dtype=np.float32)[None, :, None] * np.float32([[[1, 0.8, 0.5]]])
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.repeat(picture, 4, 0)), "raw": True, "wrap_mode": "clamp"}
+    place = mi.ScalarTransform4f().translate([0, 0.4, 0.3]).rotate([0, 1, 0], 100).scale(0.6)
+    globe = {"type": "sphere", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": picture}}
+    return scene(sensor=camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35), ball=globe, sky=constant(0.5))
+
+
+def rippled_ball() -> mi.Scene:
+    """A mirrored ball with a gentle map of heights, beside a bar that shines."""
+    heights = np.random.default_rng(5).uniform(0, 1, (8, 12, 1)).astype(np.float32)
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(heights), "raw": True, "accel": False}
+    bsdf = {"type": "bumpmap", "texture": texture, "scale": 0.02, "nested": {"type": "conductor"}}
+    shape = {"type": "sphere", "center": [0, 0.4, 0.3], "radius": 0.6, "bsdf": bsdf}
+    at = camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35)
+    return scene(sensor=at, ball=shape, bar=bar((0.5, 0.4, -0.9)), sky=constant(0.5))
+
+
 # ---------------------- Maps whose normals turn away ----------------------
 
 
@@ -356,6 +394,10 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "veil_and_mirror": (veil, LEAF, 2e-3, 4),
     "bumps": (bumps, BOARD, 2e-3, 2),
     "checkered_ball": (checkered_ball, BALL, 2e-3, 3),
+    "checkered_mirror": (lambda: checkered("mirror"), MESH, 2e-3, 2),
+    "checkered_milk": (lambda: checkered("milk"), MESH, 2e-3, 2),
+    "pictured_globe": (pictured_globe, BALL, 2e-3, 2),
+    "rippled_ball": (rippled_ball, BALL, 1e-3, 2),
     "mapped_ball": (mapped_ball, MESH, 2e-3, 2),
     "mapped_ball_camera": (mapped_ball, CAMERA, 2e-3, 2),
     "mapped_ball_map": (mapped_ball, MAP, 2e-3, 2),

@@ -50,6 +50,7 @@ def mutant(fault: str, file: str, *texts: str) -> Mutant:
     return Mutant(fault, file, tuple(zip(texts[::2], texts[1::2], strict=True)))
 
 
+TEXTURE_LINES = "edge_sampling/geometry/texture_lines.py"
 SEARCH = "plugins/integrators/_search.py"
 FOUND = "edge_sampling/boundaries/found.py"
 OUTLINES = "edge_sampling/boundaries/film_outlines.py"
@@ -451,8 +452,38 @@ MUTANTS = [
     mutant(
         "channels: seams of texture coordinates left out",
         "plugins/integrators/_channel_search.py",
-        '"seams": "uv" in self.kinds',
-        '"seams": False',
+        'seams = bool(self.kinds & {"uv", "albedo"})',
+        "seams = False",
+    ),
+    mutant(
+        "textures: lines along the edges of mirrors counted twice",
+        OUTLINES,
+        "int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaReflection)",
+        "int(mi.BSDFFlags.Null)",
+    ),
+    mutant(
+        "textures: the seams of spheres beside mirrors lost",
+        TEXTURE_LINES,
+        "[shape for shape, _ in self._shapes if shape.is_mesh()]",
+        "[shape for shape, _ in self._shapes]",
+    ),
+    mutant(
+        "textures: what does not go on around spheres lost",
+        TEXTURE_LINES,
+        "light is None and jumps_at_seam(",
+        "False and jumps_at_seam(",
+    ),
+    mutant(
+        "textures: lines along the edges of milk glass counted twice",
+        TEXTURE_LINES,
+        "rough = bends_light(shape) and",
+        "rough = False and",
+    ),
+    mutant(
+        "held points: jumps of what mirrors with maps show taken for outlines",
+        SEARCH,
+        "[s for s in at_rest if not is_mapped_mirror(s)]",
+        "list(at_rest)",
     ),
 ]
 

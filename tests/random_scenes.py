@@ -59,12 +59,16 @@ SPECIAL = {
     "beams": "spots and projectors light them, whose beams end with a jump, most often in indirect light",
     "parameters": "their materials have all kinds of values, and any parameters change (`random_parameters.py`)",
     "mirrors": "perfect mirrors and glass show what points, spots and suns light (`random_mirrors.py`)",
+    "patterns": "mirrors, glass and what shines have textures and maps (`random_patterns.py`)",
     "meshes": "things are torn, turned round, cut through themselves, or one of many faces (`random_meshes.py`)",
     "polished": "most surfaces are polished: their highlights are narrow",
     "textures": "nearly everything has textures, most of them fine (`random_textures.py`)",
     "files": "meshes are files that share materials, loaded as Mitsuba does by default (`random_files.py`)",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
+#: Those in which mirrors show what lights without size light.
+SHOWN = ("mirrors", "patterns")
+
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 
 #: Kinds of lights; those without size are in the middle.
@@ -198,11 +202,12 @@ class Generator:
         if self.home:
             self.scale, self.origin = 1.0, np.zeros(3)
         # What moves must not show instances, whose outlines were unknown: no sky, no gloss, no interreflections.
-        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams", "instances", "mirrors")
+        self.instances = self.chance(0.06) and self.special not in ("jumps", "beams", "instances", *SHOWN)
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
-        direct = {"jumps": not self.glows, "beams": False, "mirrors": False, "textures": True}.get(self.special, direct)
+        indirect = dict.fromkeys(("beams", *SHOWN), False)
+        direct = {"jumps": not self.glows, "textures": True, **indirect}.get(self.special, direct)
         self.depth = depth = 2 if direct else self.longest()
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
@@ -433,7 +438,7 @@ class Generator:
         material, bsdf = self.bsdf(uv, closed and kind != "torus")
         if not closed:
             bsdf = self.two_sided(bsdf) if bsdf["type"] not in ("roughdielectric", "thindielectric", "mask") else bsdf
-        lamp = (self.chance(0.15) and self.special not in ("cut", "mirrors")) or material == "black"
+        lamp = (self.chance(0.15) and self.special not in ("cut", *SHOWN)) or material == "black"
         has_uv = uv or kind in ("cube", "smoothcube", "sphere", "cylinder", "disk")
         emitter = self.emitter(0.5, 3, has_uv) if lamp else None
         smooth = kind in ("fine", "torus") or (kind in ("ball", "half", "needle") and self.chance(0.6))
@@ -516,7 +521,8 @@ class Generator:
 
     def make_light(self, i: int, before: list[str]) -> str:
         name = f"light{i}"
-        kind = self.pick(*{"beams": ("spot", "projector"), "mirrors": HARD, "textures": HARD}.get(self.special, LIGHTS))
+        of_special = {"beams": ("spot", "projector"), **dict.fromkeys(("textures", *SHOWN), HARD)}
+        kind = self.pick(*of_special.get(self.special, LIGHTS))
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
         centre = np.array([self.uniform(-2, 2), self.uniform(3.2, 4.5), self.uniform(-2, 2)])
@@ -660,6 +666,8 @@ def make(seed: int, sampler: str = "independent", home: bool = False, special: s
         from random_parameters import ParameterGenerator as Kind
     elif special == "mirrors":
         from random_mirrors import MirrorGenerator as Kind
+    elif special == "patterns":
+        from random_patterns import PatternGenerator as Kind
     elif special == "meshes":
         from random_meshes import MeshGenerator as Kind
     elif special == "files":

@@ -32,6 +32,9 @@ LEAST = 0.05
 #: And only where there are so many.
 FINE = 100
 
+#: Lobes of which the jumps are found by bisection.
+FOUND_ELSEWHERE = int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaReflection)
+
 
 @dataclass
 class Placed:
@@ -98,7 +101,7 @@ class FilmOutlines:
     geometry, edges, moving, turning, soft, seams : see `FilmBoundary`.
     """
 
-    _PARTS = ("edges", "corners", "spreads", "matt", "horizons", "curves", "near_cuts", "lines", "grids")
+    _PARTS = ("edges", "corners", "spreads", "dark", "matt", "horizons", "curves", "near_cuts", "lines", "grids")
     DRJIT_STRUCT = dict.fromkeys((*_PARTS, "counts", "soft", "textures", "pieces"))  # for `dr.freeze`
 
     def __init__(
@@ -120,10 +123,13 @@ class FilmOutlines:
         #: Of each edge, the number of the piece of a line of a texture that it is, plus 1; 0: it is none.
         self.pieces = mi.UInt32(edges.of_textures(geometry)) if self.textures is not None else None
         self.corners = [mi.UInt32(np.ascontiguousarray(faces[:, k])) for k in range(3)] if len(edges) else []
-        #: Which edges are on meshes that reflect light from all directions, but from behind?
+        #: Which edges are on meshes that reflect light from all directions, but from behind? And on which is that all,
+        #: besides what perfect mirrors and glass show, of which the jumps are looked for?
         known = [m.bsdf() if not is_grid(m) else None for m in geometry.meshes]
-        spread = np.array([bsdf is not None and spreads(bsdf) for bsdf in known] or [False])
-        self.spreads = mi.Bool(spread[edges.mesh[:, 0]]) if len(edges) else None
+        of_mesh = edges.mesh[:, 0]
+        spread = np.array([bsdf is not None and spreads(bsdf, FOUND_ELSEWHERE) for bsdf in known] or [False])
+        dark = np.array([bsdf is not None and not bsdf.flags() & mi.BSDFFlags.Smooth for bsdf in known] or [False])
+        self.spreads, self.dark = (mi.Bool(of[of_mesh]) if len(edges) else None for of in (spread, dark))
         #: And which on meshes that are matt? None where these have few creases, and there is little to gain.
         matt = np.array([bsdf is not None and is_matt(bsdf) for bsdf in known] or [False])
         matt = matt[edges.mesh].all(1)
@@ -292,7 +298,9 @@ class FilmOutlines:
             for a, b in (self.edges.end_points(positions, edge), self._cut(at, face)):
                 lengths.append(projection.clip(a, b).length)
             # The less faces turn, the less their planes hide: about as the square of the angle.
-            bend = self.edges.bend(positions, edge) * lengths[0] if self.soft and self.edges.any_smooth else 0
+            bend = mi.Float(0)
+            if self.soft and self.edges.any_smooth:
+                bend = dr.select(self.dark, 0, self.edges.bend(positions, edge) * lengths[0])
             lengths[0] = dr.select(jumps, lengths[0], bend)
             if self.matt is not None and by_angle:
                 lengths[0] *= self._part_of_crease(at, edge)

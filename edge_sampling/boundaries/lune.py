@@ -8,10 +8,13 @@ import drjit as dr
 import mitsuba as mi
 
 
-def spreads(bsdf: mi.BSDF | mi.BSDFPtr) -> mi.Bool | bool:
+def spreads(bsdf: mi.BSDF | mi.BSDFPtr, besides: int = int(mi.BSDFFlags.Null)) -> mi.Bool | bool:
     """Does it reflect light from all directions, and let none through, unless as if nothing was there? Only then may
-    light be sampled in a lune."""
-    others = (mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission) & ~int(mi.BSDFFlags.Null)
+    light be sampled in a lune.
+
+    besides : perfect lobes of which the jumps are found in other ways.
+    """
+    others = (mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission) & ~besides
     return (bsdf.flags() & others) == 0
 
 

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from . import meshes
 from .edges import SLIVER, EdgeKind, Edges, Weld
 from .meshes import Geometry
+from .texture_lines import jumps_at_every_edge
 
 #: An end point closer to the end of an edge than this, relative to its length, is not inside of it.
 TOUCHES = 1e-3
@@ -243,5 +244,5 @@ def _pair(
 
 def _is_even(mesh: object) -> bool:
     """Is the plane of its faces all that differs between the faces of a mesh?"""
-    varies = meshes.has_interpolated_normals(mesh) or meshes.jumps_at_every_edge(mesh)
+    varies = meshes.has_interpolated_normals(mesh) or jumps_at_every_edge(mesh)
     return not varies and meshes.vertex_values(mesh).shape[1] == 0

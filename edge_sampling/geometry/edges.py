@@ -15,6 +15,7 @@ from rimlight.edge_sampling.refusals import InputError
 from . import meshes
 from .grids import is_grid
 from .meshes import Geometry
+from .texture_lines import jumps_at_every_edge
 
 
 class EdgeKind(IntEnum):
@@ -172,7 +173,7 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     mesh0, mesh1 = mesh_of_face[face0], mesh_of_face[face1]
 
     interpolated = np.array([meshes.has_interpolated_normals(m) for m in geometry.meshes])
-    everywhere = np.array([not is_grid(m) and meshes.jumps_at_every_edge(m) for m in geometry.meshes])
+    everywhere = np.array([not is_grid(m) and jumps_at_every_edge(m) for m in geometry.meshes])
     split = (i0 != i1) | (j0 != j1)
     seam = split & ((value[i0] != value[i1]).any(1) | (value[j0] != value[j1]).any(1))
 

@@ -325,18 +325,6 @@ def bent_faces(mesh: Any) -> mi.Bool:
     return bent
 
 
-def jumps_at_every_edge(mesh: Any) -> bool:
-    """Does something jump wherever two faces of the mesh meet? Attributes of faces; textures without texture
-    coordinates, for which the place inside of its own triangle stands; and what depends on the tangents of a face:
-    anisotropic materials, bump and normal maps."""
-    if attribute_names(mesh, "face_"):
-        return True
-    objects = list(objects_below(inner(mesh)).values())
-    if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or is_map(o)) for o in objects):
-        return True
-    return not has_texcoords(mesh) and any(has_place(o) for o in objects)
-
-
 def bends_light(shape: Any) -> bool:
     """Does light go through a surface, refracted or scattered?"""
     return shape.bsdf() is not None and bool(shape.bsdf().flags() & mi.BSDFFlags.Transmission & ~mi.BSDFFlags.Null)

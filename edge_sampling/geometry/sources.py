@@ -3,12 +3,13 @@
 Edges are found on the host, which takes seconds for a million of them; an optimisation step takes milliseconds. So they
 are kept as long as what they were derived from stays as it was: which shapes, materials and lights there are, their
 faces, which vertices lie at the same place, and where attributes differ between those; which beams end with a jump,
-which textures are even, and where they have their texels. Vertices may move, as long as none of them part, and none
-meet, and the vertex normals of flat faces stay theirs.
+which textures are even, or go on around a sphere, and where they have their texels. Vertices may move, as long as none
+of them part, and none meet, and the vertex normals of flat faces stay theirs.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -30,11 +31,12 @@ from .meshes import (
     normals_of,
     objects_below,
     positions_of,
+    surfaces,
     texcoords_of,
     vertex_attributes,
 )
 from .parameters import Parameter
-from .texture_lines import is_even, numbers_of_place, texture_values
+from .texture_lines import SEAM_OF, is_even, jumps_at_seam, numbers_of_place, texture_values
 
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
 APART = 64
@@ -81,6 +83,10 @@ class Sources:
         dr.eval(self._differing)
         #: Lights and textures: by which arrays, and by which question, it is told whether something jumps.
         self._pictures = {e: (border_values, has_hard_beam) for e in scene.emitters() if e.class_name() in BEAMS}
+        round_ = [s for s in surfaces(scene) if s.class_name() in SEAM_OF]
+        of = {o: s.class_name() for s in round_ for o in objects_below(s).values() if has_place(o)}
+        closed = {o: partial(jumps_at_seam, shape=name) for o, name in of.items() if not jumps_at_seam(o, name)}
+        self._pictures |= {o: (texture_values, answer) for o, answer in closed.items()}
         even = [o for o in objects_below(scene).values() if has_place(o) and is_even(o)]
         self._pictures |= dict.fromkeys(even, (texture_values, is_even))
         self._answers = {o: (values(o), answer(o)) for o, (values, answer) in self._pictures.items()}
@@ -142,7 +148,8 @@ class Sources:
         return True
 
     def _same_pictures(self) -> bool:
-        """Do those beams end with a jump that did so, and are textures even that were? Looks at what was replaced."""
+        """Do those beams end with a jump that did so, and are textures even that were, and without a seam? Looks at
+        what was replaced."""
         for o, (held, before) in self._answers.items():
             values, answer = self._pictures[o]
             new = values(o)

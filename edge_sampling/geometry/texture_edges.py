@@ -21,12 +21,11 @@ from .meshes import (
     faces,
     has_texcoords,
     inner,
-    jumps_at_every_edge,
     texcoords_of,
     texture_coordinates,
     vertices,
 )
-from .texture_lines import lattices
+from .texture_lines import jumps_at_every_edge, lattices
 
 #: Vertices that stand for a piece: its two ends, and a point on each side of it.
 VERTICES = 4

@@ -1,5 +1,6 @@
-"""Lines at which textures jump: checkerboards, bitmaps with the `nearest` filter, the slopes of bump maps; and those
-along which mapped normals turn away from the viewer; and those at which the light of spots and projectors jumps.
+"""Lines at which textures jump: checkerboards, bitmaps with the `nearest` filter, the slopes of bump maps, and what
+does not go on around a sphere; and those along which mapped normals turn away from the viewer; and those at which the
+light of spots and projectors jumps.
 
 Each of them is where a function of a point on the surface is whole. Textures jump at the lines of a lattice: where a
 component of A·(u, v, 1) is whole, with a matrix A of its own.
@@ -23,12 +24,14 @@ from .boxes import box_around
 from .mapped_horizons import mapped_horizons
 from .meshes import (
     Geometry,
+    attribute_names,
+    bends_light,
+    has_interpolated_normals,
     has_place,
     has_texcoords,
     inner,
     is_map,
     is_met,
-    jumps_at_every_edge,
     objects_below,
     pointer,
     surfaces,
@@ -44,6 +47,12 @@ TEXTURE_UNIT_STEP = 1 / 256
 #: Texels at which a bitmap is looked at for such steps, places in each step, and the first texels of a row that are
 #: looked at: as far as single precision tells these places apart.
 TEXELS, PLACES_OF_STEP, FIRST_TEXELS = 1024, 8, 2048
+
+#: Shapes whose texture coordinates begin and end at a line, and which of both does: the azimuth.
+SEAM_OF = {"Sphere": 0, "Cylinder": 0, "Disk": 1}
+
+#: Points of such a line at which textures are compared.
+PLACES_OF_SEAM = 64
 
 #: Points at which a volume is looked at for its brightest and its darkest voxel.
 PLACES = 2**20
@@ -159,8 +168,8 @@ class TextureLines:
         return found
 
     def has_own(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Does the shape of a point have lines of its own?"""
-        return _is_one_of(si, [shape for shape, _ in self._shapes])
+        """Is a point on a mesh that has lines of its own? (The seams of other shapes are lines like all others.)"""
+        return _is_one_of(si, [shape for shape, _ in self._shapes if shape.is_mesh()])
 
     def jump_at_edges(self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Does what jumps between two faces of the mesh that is met jump at their edge, and not at a line?"""
@@ -241,7 +250,41 @@ def lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
             found.append(Lattice(matrix - [[0, 0, 0.5], [0, 0, 0.5]], light, step))
         elif _jumps(o, *_range(o, uv)):
             found.append(Lattice(matrix, light))
+        elif light is None and jumps_at_seam(o, shape.class_name()):
+            # On a circle, there is no function that jumps once only: on the other side, a line counts that is none.
+            halves, k = np.array([[0, 0, 0.5], [0, 0, 0.5]]), SEAM_OF[shape.class_name()]
+            halves[k, k], halves[k, 2] = 2, 0
+            found.append(Lattice(halves))
     return found
+
+
+def jumps_at_seam(texture: mi.Texture, shape: str) -> bool:
+    """Does a texture differ between both sides of the line at which the texture coordinates of a kind of shape begin
+    and end? Bitmaps do that do not repeat, and all that are scaled. shape : class name."""
+    if shape not in SEAM_OF:
+        return False
+    along = np.random.default_rng(0).uniform(0, 1, PLACES_OF_SEAM).astype(np.float32)
+    sides = [np.full_like(along, x) for x in (0, np.nextafter(np.float32(1), np.float32(0)))]
+    with dr.suspend_grad():
+        a, b = (np.array(_value(texture, mi.Point2f(*np.roll([s, along], SEAM_OF[shape], 0)))) for s in sides)
+    return bool(np.abs(a - b).max() > 1e-3 * np.abs([a, b]).max())
+
+
+def jumps_at_every_edge(mesh: Any) -> bool:
+    """Does something jump wherever two faces of the mesh meet? Attributes of faces; textures without texture
+    coordinates, for which the place inside of its own triangle stands; and what depends on the tangents of a face:
+    anisotropic materials, bump and normal maps. And textures that jump where light goes through a smooth-shaded mesh,
+    of which all that differs between two faces is compared at their edge, for the sake of their planes."""
+    if attribute_names(mesh, "face_"):
+        return True
+    shape = inner(mesh)
+    rough = bends_light(shape) and shape.bsdf().flags() & mi.BSDFFlags.Smooth
+    if rough and has_interpolated_normals(mesh) and lattices(shape):
+        return True
+    objects = list(objects_below(shape).values())
+    if any(isinstance(o, mi.BSDF) and (o.flags() & mi.BSDFFlags.Anisotropic or is_map(o)) for o in objects):
+        return True
+    return not has_texcoords(mesh) and any(has_place(o) for o in objects)
 
 
 def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:

@@ -53,7 +53,8 @@ class ChannelSearch(BoundarySearch):
         film = None
         if on_film.any():
             # Where normals of faces are shown, edges of smooth-shaded meshes count, in proportion to their bend.
-            which = {"soft": "geo_normal" in self.kinds, "seams": "uv" in self.kinds}
+            seams = bool(self.kinds & {"uv", "albedo"})
+            which = {"soft": "geo_normal" in self.kinds, "seams": seams}
             edges = self._jumping(self._edges_of(self.geometry))
             film = FilmBoundary(self.geometry, edges, on_film, NoLights(), **which)
             film = film if any(film.outlines.counts) else None

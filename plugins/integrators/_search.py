@@ -54,6 +54,7 @@ from rimlight.edge_sampling.geometry.texture_lines import looked_at_once
 from rimlight.edge_sampling.parametrisation import Slides, slides_behind_glass
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.edge_sampling.turning_lobes import is_curved, turning_lobes
+from rimlight.transport.film_chains import is_mapped_mirror
 from rimlight.transport.paths import Depths
 
 from ._clipping import cut_by_clipping_planes
@@ -371,6 +372,8 @@ class BoundarySearch:
         shapes = surfaces(scene) if mirrors else dict.fromkeys(inner(s) for s in moving.with_lines)
         everywhere = mirrors or moving.camera or moving.lights
         sliding = [inner(s) for s in moving.sliding]
+        # What mirrors with maps show jumps at their lines: these must be known, even if they do not move.
+        at_rest = [s for s in at_rest if not is_mapped_mirror(s)]
         elsewhere = [*(inner(self.geometry.meshes[i]) for i in self._textures_on_film(moving, at_rest)), *at_rest]
         lit = None if everywhere else moving.shapes
         lines = TextureLines(shapes, scene.emitters(), lit, sliding, elsewhere)

@@ -218,8 +218,8 @@ def _at_outline(scene: mi.Scene, at: Parting, segment: Segment) -> tuple[Touch, 
 def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch, mi.Float, mi.Float] | None) -> Parting:
     """What is seen on both sides of a jump, a little farther aside than it is known.
 
-    Close to the edges of mirrors and glass, to inner edges of acute corners, and to lines in which surfaces cut each
-    other, rays start beyond the other surface. Close to a line of a texture, few numbers are left in single
+    Close to the edges of glass, to inner edges of acute corners, and to lines in which surfaces cut each other, rays
+    start beyond the other surface. Close to a line of a texture, few numbers are left in single
     precision, and often one of both rays meets the line itself, which may belong to either side: to Mitsuba's
     `checkerboard`, to the other one. This looks past that, unless other faces, or other parts of the texture, are
     there.
@@ -227,7 +227,7 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
     aside = dr.zeros(mi.Float, dr.width(at.found))
     if outline is not None:
         touch, along, _ = outline
-        lifts = dr.select(_goes_on(at.a) | _goes_on(at.b), BEHIND, _overhang(at, segment))
+        lifts = dr.select(_goes_in(at.a) | _goes_in(at.b), BEHIND, _overhang(at, segment))
         aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
         aside = dr.select(~at.on_texture & ~at.on_shadow & ~at.grazes, aside, 0)
     if chains.textures is not None:
@@ -266,11 +266,12 @@ def _overhang(at: Parting, segment: Segment) -> mi.Float:
     return dr.select(meet, overhang(*normals), 0)
 
 
-def _goes_on(vertex: Vertex) -> mi.Bool:
-    """Does a mirror or glass reflect or refract the ray there?"""
+def _goes_in(vertex: Vertex) -> mi.Bool:
+    """Does glass that may have edges refract the ray there? Spheres have none, and darken towards their outline: what
+    is a little aside of that is not what is on it."""
     si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.Minimal)
-    flags = si.bsdf().flags()
-    return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+    is_mesh = si.shape.is_mesh() | (si.instance != None)  # noqa: E711
+    return is_mesh & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
 
 
 def _at_line(scene: mi.Scene, textures: TextureLines, at: Parting) -> tuple[Line, mi.Float, mi.Float]:

@@ -12,6 +12,7 @@ from cases import CAMERA_X, case, diffuse
 from fine_textures import TEXELS, bitmap, fine, stage
 from frozen import Step, assert_same, losses_and_gradients, numbers, one_thread
 from instances import stretched_ball
+from mirrors import checkered, rippled_mirror
 from polished import lacquer, metal
 from random_scenes import ball
 
@@ -90,6 +91,31 @@ def test_derivatives_are_the_same_if_nothing_is_held(variant, monkeypatch, kind)
     assert_equal(*made, noise=0.1)
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(checkered, "mirror"),
+        partial(checkered, "mirror", mesh_=False),
+        partial(checkered, "lacquer"),
+        partial(checkered, "lacquer", mesh_=False),
+        rippled_mirror,
+    ],
+    ids=["mirror", "mirrored sphere", "lacquer", "lacquered sphere", "map"],
+)
+def test_derivatives_of_mirrors_are_the_same_if_nothing_is_held(variant, monkeypatch, make):
+    """Lines of their textures lie on edges of the mesh, and on the seam of the sphere; and maps jump in what they
+    show."""
+    made = []
+    for held_shapes in (lambda _scene, _sensor, shapes: shapes, lambda *_: []):
+        monkeypatch.setattr("rimlight.integrators._search.turning_lobes", held_shapes)
+        scene, integrator = make(), mi.load_dict({"type": "direct_edge"})
+        thing = next(s for s in scene.shapes() if s.id() in ("ball", "mirror"))
+        key = f"{thing.id()}.{'vertex_positions' if thing.id() == 'ball' and thing.is_mesh() else 'to_world'}"
+        motion = Motion(scene, key, direction=[1, 0.3, 0.4])
+        made.append(np.array([derivative_image(scene, integrator, motion, spp=64, seed=i) for i in range(8)], float))
+    assert_equal(*made, noise=0.15)
+
+
 def of_floor(scene, texels):
     """Give the floor of `stage` these texels."""
     params = mi.traverse(scene)
@@ -153,7 +179,7 @@ def rounded(bsdf, flat=False):
         ({"type": "conductor"}, False, True),
         ({"type": "dielectric"}, False, True),
         ({"type": "conductor"}, True, False),
-        ({"type": "conductor", "specular_reflectance": {"type": "checkerboard"}}, False, False),
+        ({"type": "conductor", "specular_reflectance": {"type": "checkerboard"}}, False, True),
         (metal(0.05), False, True),
         (lacquer(0.05), False, True),
         (metal(0.05), True, False),
