@@ -264,6 +264,15 @@ def checkered(kind: str, mesh_: bool = True) -> mi.Scene:
     return scene(sensor=camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35), ball=shape, sky=constant(0.5))
 
 
+def checkered_facets() -> mi.Scene:
+    """A flat-shaded ball with such lines, close over a floor that it lights."""
+    vertices, _, uv, faces = ball(8)
+    bsdf = {"type": "diffuse", "reflectance": checkers(colour0=0.05, colour1=(0.9, 0.8, 0.7), scale=(4, 4), turned=0)}
+    shape = mesh("ball", 0.5 * vertices + [0, 0.4, 0.3], faces, uv=uv, bsdf=bsdf)
+    floor = horizontal((0, -0.15, 0), 2, "floor", bsdf=diffuse(0.8))
+    return scene(sensor=camera((0.4, 1.2, -3.2), (0, 0.2, 0), fov=35), ball=shape, floor=floor, sky=constant(0.5))
+
+
 def pictured_globe() -> mi.Scene:
     """A globe whose picture does not go on around it: its seam is seen."""
     picture = np.linspace(0.1, 1, 8, dtype=np.float32)[None, :, None] * np.float32([[[1, 0.8, 0.5]]])
@@ -396,6 +405,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "checkered_ball": (checkered_ball, BALL, 2e-3, 3),
     "checkered_mirror": (lambda: checkered("mirror"), MESH, 2e-3, 2),
     "checkered_milk": (lambda: checkered("milk"), MESH, 2e-3, 2),
+    "checkered_facets": (checkered_facets, MESH, 2e-3, 3),
     "pictured_globe": (pictured_globe, BALL, 2e-3, 2),
     "rippled_ball": (rippled_ball, BALL, 1e-3, 2),
     "mapped_ball": (mapped_ball, MESH, 2e-3, 2),

@@ -480,6 +480,12 @@ MUTANTS = [
         "rough = False and",
     ),
     mutant(
+        "textures: lines along the edges of facets counted twice",
+        "edge_sampling/geometry/texture_edges.py",
+        "crossed &= ~self._on_crease(positions)",
+        "pass",
+    ),
+    mutant(
         "held points: jumps of what mirrors with maps show taken for outlines",
         SEARCH,
         "[s for s in at_rest if not is_mapped_mirror(s)]",

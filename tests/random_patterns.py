@@ -2,7 +2,8 @@
 
     python tests/random_scenes.py --special patterns --seeds 957000 957020
 
-All shapes have them: spheres and cylinders, and meshes without texture coordinates as well.
+All shapes have them: spheres and cylinders, and meshes without texture coordinates as well. Paths have two segments, or
+three, and then all lights are points, spots and suns, as in `random_mirrors.py`.
 """
 
 from __future__ import annotations
@@ -28,11 +29,15 @@ class PatternGenerator(MirrorGenerator):
         colours = {"color0": self.uniform(0, 0.3), "color1": self.colour()}
         return {"type": "checkerboard", **colours, "to_uv": place}
 
+    def number(self) -> dict:
+        made = self.pattern(0, 1)
+        return made if made["type"] == "checkerboard" else {**made, "raw": True}
+
     def bsdf(self, uv: bool = False, closed: bool = False) -> tuple[str, dict]:
         if self.chance(0.2):
             return super().bsdf(uv, closed)
         alpha = self.uniform(0.03, 0.3)
-        kinds = ["conductor", "plastic", "roughconductor", "roughplastic", "principled"]
+        kinds = ["conductor", "plastic", "roughconductor", "roughplastic", "principled", "blend", "mask", "both"]
         kind = self.pick(*kinds, *(["dielectric", "roughdielectric", "trans"] if closed else []))
         through = lambda: {"specular_reflectance": self.colour(0.6), "specular_transmittance": self.pattern()}
         bsdf = {
@@ -41,6 +46,22 @@ class PatternGenerator(MirrorGenerator):
             "roughconductor": lambda: {"type": kind, "alpha": alpha, "specular_reflectance": self.pattern()},
             "roughplastic": lambda: {"type": kind, "alpha": alpha, "diffuse_reflectance": self.pattern()},
             "principled": lambda: {"type": kind, "base_color": self.pattern(), "roughness": 0.2 + alpha},
+            "blend": lambda: {
+                "type": "blendbsdf",
+                "weight": self.number(),
+                "one": {"type": "conductor", "specular_reflectance": self.colour(0.6)},
+                "two": {"type": self.pick("diffuse", "plastic", "roughplastic")},
+            },
+            "mask": lambda: {
+                "type": "mask",
+                "opacity": self.number(),
+                "inner": {"type": "twosided", "inner": {"type": self.pick("conductor", "plastic", "roughplastic")}},
+            },
+            "both": lambda: {
+                "type": "twosided",
+                "front": {"type": "conductor", "specular_reflectance": self.pattern()},
+                "back": {"type": "diffuse", "reflectance": self.pattern()},
+            },
             "dielectric": lambda: {"type": kind, "int_ior": self.uniform(1.1, 1.6), **through()},
             "roughdielectric": lambda: {"type": kind, "int_ior": 1.3, "alpha": 0.2 + alpha, **through()},
             "trans": lambda: {
@@ -50,7 +71,7 @@ class PatternGenerator(MirrorGenerator):
                 "spec_trans": self.uniform(0.2, 0.8),
             },
         }[kind]()
-        if self.chance(0.25) and kind not in ("trans", "principled"):
+        if self.chance(0.25) and kind not in ("trans", "principled", "blend", "mask", "both"):
             return f"mapped-{kind}", self.mapped(bsdf)
         return f"patterned-{kind}", bsdf
 

@@ -66,7 +66,7 @@ SPECIAL = {
     "files": "meshes are files that share materials, loaded as Mitsuba does by default (`random_files.py`)",
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
-#: Those in which mirrors show what lights without size light.
+#: Those whose mirrors show what lights without size light, if paths are long enough.
 SHOWN = ("mirrors", "patterns")
 
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
@@ -206,8 +206,7 @@ class Generator:
         # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
         self.glows = self.special == "jumps" and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
-        indirect = dict.fromkeys(("beams", *SHOWN), False)
-        direct = {"jumps": not self.glows, "textures": True, **indirect}.get(self.special, direct)
+        direct = {"jumps": not self.glows, "textures": True, "beams": False, "mirrors": False}.get(self.special, direct)
         self.depth = depth = 2 if direct else self.longest()
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
@@ -223,8 +222,9 @@ class Generator:
         kinds: list[str] = []
         for i in range(self.rng.integers(1, 3)):
             kinds.append(self.make_light(i, kinds))
-        if self.special == "jumps" and not {"sky", "environment"} & set(kinds):
-            # Without one, `path` drops light that comes through a mask or a thin glass.
+        skies = self.special == "jumps" or (self.special == "patterns" and direct)
+        if skies and not {"sky", "environment"} & set(kinds):
+            # Without one, `path` drops light that comes through a mask or a thin glass; and mirrors show little.
             self.objects["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}}
         scene = mi.load_dict(self.objects)
         params, move = self.make_motion(scene, cameras=not self.instances)
@@ -521,7 +521,8 @@ class Generator:
 
     def make_light(self, i: int, before: list[str]) -> str:
         name = f"light{i}"
-        of_special = {"beams": ("spot", "projector"), **dict.fromkeys(("textures", *SHOWN), HARD)}
+        of_special = {"beams": ("spot", "projector"), **dict.fromkeys(("textures", "mirrors"), HARD)}
+        of_special["patterns"] = LIGHTS if self.depth == 2 else HARD
         kind = self.pick(*of_special.get(self.special, LIGHTS))
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"

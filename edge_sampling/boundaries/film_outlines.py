@@ -130,9 +130,14 @@ class FilmOutlines:
         spread = np.array([bsdf is not None and spreads(bsdf, FOUND_ELSEWHERE) for bsdf in known] or [False])
         dark = np.array([bsdf is not None and not bsdf.flags() & mi.BSDFFlags.Smooth for bsdf in known] or [False])
         self.spreads, self.dark = (mi.Bool(of[of_mesh]) if len(edges) else None for of in (spread, dark))
-        #: And which on meshes that are matt? None where these have few creases, and there is little to gain.
+        #: And which on meshes that are matt, without lines? None where these have few creases, and there is little to
+        #: gain.
         matt = np.array([bsdf is not None and is_matt(bsdf) for bsdf in known] or [False])
         matt = matt[edges.mesh].all(1)
+        if (
+            self.textures is not None
+        ):  # what jumps at creases along which there is a line is more than their angle tells
+            matt &= ~np.isin(edges.mesh, list(self.textures.along_edges)).any(1)
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None
         self.curves = Curves.of(geometry, moving[len(geometry.meshes) :], seams=seams)

@@ -4,6 +4,7 @@ that a line crosses.
 The camera and points of a path see them as they see edges. (What has no such lines, and what mirrors show of them, is
 found on the film: `terms/bisection.py`.)
 A line moves with its triangle, and over it, if the texture coordinates change. A face belongs to both of its sides.
+Where it runs along an edge at which something else jumps as well, that edge counts, and the line does not.
 """
 
 from __future__ import annotations
@@ -14,13 +15,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .device_edges import COPLANAR
 from .edges import WHOLE, EdgeKind, Edges
 from .grids import is_grid
+from .interpolated import texture_slides
 from .meshes import (
     Geometry,
     faces,
+    has_interpolated_normals,
     has_texcoords,
     inner,
+    normals_of,
     texcoords_of,
     texture_coordinates,
     vertices,
@@ -52,7 +57,7 @@ class TextureEdges:
     every : do fine textures count, too, that rest on their surface?
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("_corners", "_rows", "_sizes"))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("_corners", "_beyond", "_rows", "_sizes"))  # for `dr.freeze`
 
     def __init__(self, geometry: Geometry, *, every: bool):
         self._meshes, self._left_out, self._every = geometry.meshes, set(), every
@@ -62,13 +67,17 @@ class TextureEdges:
             if not is_grid(m) and has_texcoords(inner(m)) and (found := lattices(inner(m)))
         }
         self.capacities = dict.fromkeys(self._lattices, 0)
+        #: Flat-shaded meshes with lines along their edges.
+        self.along_edges: set[int] = set()
         #: Most lines across each mesh, in one direction.
         self._across = dict.fromkeys(self._lattices, 0)
         self._at: dict[int, mi.Float] = {}
         self._pieces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        #: Of each piece: the corners of its triangle, among all vertices; the coefficients of u, v, and 1 in the
-        #: function that is 0 on the line; and the size of the terms of that.
+        #: Of each piece: the corners of its triangle, among all vertices; if it runs along an edge of a flat-shaded
+        #: mesh, from the first to the second, and the third of the face beyond, else of its own; the coefficients of u,
+        #: v, and 1 in the function that is 0 on the line; and the size of the terms of that.
         self._corners: list[mi.UInt32] = []
+        self._beyond = mi.UInt32(0)
         self._rows: list[mi.Float] = []
         self._sizes = mi.Float(1)
 
@@ -123,27 +132,32 @@ class TextureEdges:
         if not self.capacity:
             return False
         offsets = np.cumsum([0, *(m.vertex_count() for m in self._meshes)])
-        corners, rows = [np.zeros((0, 3), np.int64)], [np.zeros((0, 4))]
+        corners, rows = [np.zeros((0, 4), np.int64)], [np.zeros((0, 4))]
         for i, (triangle, row) in self._pieces.items():
             rest = self.capacities[i] - len(triangle)
-            corners += [triangle + offsets[i], np.zeros((rest, 3), np.int64)]
+            corners += [triangle + offsets[i], np.zeros((rest, 4), np.int64)]
             rows += [row, np.tile([0.0, 0, -1, 1], (rest, 1))]
         corners, rows = np.concatenate(corners), np.concatenate(rows).astype(np.float32)
         # Not in NumPy's memory, for frozen functions.
-        self._corners = [mi.UInt32(corners[:, k].astype(np.uint32)) + dr.opaque(mi.UInt32, 0) for k in range(3)]
+        of_corners = [mi.UInt32(corners[:, k].astype(np.uint32)) + dr.opaque(mi.UInt32, 0) for k in range(4)]
+        *self._corners, self._beyond = of_corners
         *self._rows, self._sizes = (mi.Float(rows[:, k].copy()) * dr.opaque(mi.Float, 1) for k in range(4))
-        dr.eval(self._corners, self._rows, self._sizes)
+        dr.eval(self._corners, self._beyond, self._rows, self._sizes)
         return self.capacities != before or bool((self.fine != were_fine).any())
 
     def _of_mesh(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices of the triangles of the pieces of a mesh, (P, 3), and their coefficients and sizes, (P, 4)."""
+        """Vertices of the triangles of the pieces of a mesh, and the corners beyond, (P, 4); and their coefficients and
+        sizes, (P, 4)."""
         mesh = inner(self._meshes[i])
         face, uv = faces(mesh).astype(np.int64), texture_coordinates(mesh).astype(np.float64)
         self._left_out.discard(i)
+        self.along_edges.discard(i)
         self._across[i] = 0
-        inside = _edges_inside(np.concatenate([vertices(mesh), uv], 1), face)
-        inside &= not jumps_at_every_edge(mesh)  # its edges count by themselves
-        which, rows = [np.zeros(0, np.int64)], [np.zeros((0, 4))]
+        smooth = has_interpolated_normals(mesh)
+        goes_on = [vertices(mesh), uv, *([np.array(dr.detach(normals_of(mesh))).reshape(-1, 3)] if smooth else [])]
+        beyond = _corners_beyond(np.concatenate(goes_on, 1), face)
+        inside = (beyond >= 0) & (not jumps_at_every_edge(mesh))  # its edges count by themselves
+        which, corners, rows = [np.zeros(0, np.int64)], [np.zeros((0, 4), np.int64)], [np.zeros((0, 4))]
         for lattice in self._lattices[i]:
             for row in lattice.matrix:
                 at = uv @ row[:2] + row[2]
@@ -155,21 +169,27 @@ class TextureEdges:
                 count = np.where(np.isfinite(upper - lower), upper - lower, 0).astype(np.int64)
                 if sum(map(len, which)) + count.sum() > MOST:
                     self._left_out.add(i)
-                    return np.zeros((0, 3), np.int64), np.zeros((0, 4))
+                    return np.zeros((0, 4), np.int64), np.zeros((0, 4))
                 of = np.repeat(np.arange(len(face)), count)
                 k = lower[of] + 1 + np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
                 on_line = at[of] == k[:, None]
-                along = [on_line[:, j] & on_line[:, (j + 1) % 3] & ~inside[of, j] for j in range(3)]
-                keep = ~np.any(along, axis=0)
+                along = np.stack([on_line[:, j] & on_line[:, (j + 1) % 3] for j in range(3)], 1)
+                keep = ~(along & ~inside[of]).any(1)
                 row_of = [*(np.full(len(k), x) for x in row[:2]), row[2] - k, np.maximum(lattice.size, np.abs(k))]
                 which.append(of[keep])
+                if not smooth and along.any():
+                    self.along_edges.add(i)
+                side = np.where(smooth, 0, along.argmax(1))
+                turned = face[of[:, None], (side[:, None] + np.arange(3)) % 3]
+                third = np.where(smooth | ~along.any(1), turned[:, 2], beyond[of, side])
+                corners.append(np.column_stack([turned, third])[keep])
                 rows.append(np.stack(row_of, 1)[keep])
-        which, rows = np.concatenate(which), np.concatenate(rows)
+        which, corners, rows = np.concatenate(which), np.concatenate(corners), np.concatenate(rows)
         # Lines of several textures may coincide.
         line = rows[:, :3] / np.linalg.norm(rows[:, :2], axis=1, keepdims=True)
         line *= np.where(line[:, :1] + np.sqrt(2) * line[:, 1:2] < 0, -1, 1)
         first = np.unique(np.column_stack([which, np.round(line, 6) + 0.0]), axis=0, return_index=True)[1]
-        return face[which[first]], rows[first]
+        return corners[first], rows[first]
 
     # ---------------------- As edges ----------------------
 
@@ -183,6 +203,7 @@ class TextureEdges:
         corners, height = self._triangles(positions)
         above = [h >= 0 for h in height]
         crossed = (above[0] != above[1]) | (above[0] != above[2])
+        crossed &= ~self._on_crease(positions)
         # The corner that has the line between itself and the two others, first.
         for k in (1, 2):
             alone = (above[k] != above[0]) & (above[k] != above[3 - k])
@@ -197,6 +218,17 @@ class TextureEdges:
             aside = dr.cross(b - a, dr.normalize(normal))
             sides = [mi.Point3f(a + dr.select(crossed, s * aside, 0)) for s in (1, -1)]
         return [*ends, *sides]
+
+    def _on_crease(self, positions: mi.Float) -> mi.Bool:
+        """Which pieces run along edges at which flat faces meet, and do not move over these? Detached."""
+        p, piece, rests, start = dr.detach(positions), dr.arange(mi.UInt32, self.capacity), mi.Bool(True), 0
+        for i, capacity in self.capacities.items():
+            if texture_slides(inner(self._meshes[i])):
+                rests &= (piece < start) | (piece >= start + capacity)
+            start += capacity
+        a, b, c, beyond = (dr.gather(mi.Point3f, p, corner) for corner in (*self._corners, self._beyond))
+        first, second = (dr.normalize(dr.cross(b - a, other - a)) for other in (c, beyond))
+        return rests & (dr.norm(dr.cross(first, second)) > COPLANAR)
 
     def beside(self, positions: mi.Float, piece: mi.UInt32) -> mi.Float:
         """How far beside a line rays tell its sides, scene units; detached."""
@@ -245,10 +277,15 @@ class TextureEdges:
         )
 
 
-def _edges_inside(values: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Which sides of faces, from a vertex to the next one, have another face beyond them on which all that vertices
-    have in `values` goes on: (F, 3), bool."""
+def _corners_beyond(values: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Which sides of faces, from a vertex to the next one, have one other face beyond them on which all that vertices
+    have in `values` goes on, and that is turned the same way: the third vertex of that, (F, 3); otherwise −1."""
     place = np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)[face]
-    sides = np.sort(np.stack([place, np.roll(place, -1, 1)], 2), axis=2).reshape(-1, 2)
-    _, number, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    return (count[number.reshape(-1)] > 1).reshape(-1, 3)
+    ends = np.stack([place, np.roll(place, -1, 1)], 2).reshape(-1, 2)
+    _, number, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    number, corner = number.reshape(-1), np.roll(face, -2, 1).reshape(-1)
+    # Of both sides of an edge, the sums of what the one and the other have.
+    of_both = np.bincount(number, corner, len(count)).astype(np.int64)
+    forwards = np.bincount(number, ends[:, 0] < ends[:, 1], len(count)).astype(np.int64)
+    one = (count == 2) & (forwards == 1)
+    return np.where(one[number], of_both[number] - corner, -1).reshape(-1, 3)

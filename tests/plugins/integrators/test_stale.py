@@ -226,6 +226,21 @@ def test_a_texture_that_comes_to_jump(kind):
     assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
 
 
+def test_a_picture_that_comes_to_jump_at_the_seam_of_a_globe():
+    """Its first column and its last are equal at first."""
+    first = np.tile(np.float32([0.5, 0.2, 0.5])[None, :, None], (2, 1, 3))
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(first), "raw": True, "wrap_mode": "clamp"}
+    place = mi.ScalarTransform4f().rotate([0, 1, 0], 90)
+    globe = {"type": "sphere", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": picture}}
+    scene, used = cases.scene(sensor=cases.camera(), globe=globe, sky=cases.constant()), direct_edge()
+    before = derivative(scene, used, "globe.to_world")
+    params = mi.traverse(scene)
+    params["globe.bsdf.reflectance.data"] = mi.TensorXf(first * np.float32([1.9, 1, 0.1])[None, :, None])
+    params.update()
+    after = assert_as_fresh(scene, used, direct_edge, "globe.to_world")
+    assert np.abs(after - before).sum() > 0.2 * np.abs(before).sum()
+
+
 @pytest.mark.parametrize("what", TEXTURES)
 def test_textures_jump_at_other_places(monkeypatch, what):
     """(Whether their points are held is decided once, and changes the noise.)"""
