@@ -61,6 +61,20 @@ def bar(centre=(0.1, 0.4, 0.8)) -> mi.Mesh:
     return mesh("bar", vertices, CUBE_FACES, bsdf=diffuse(0.0), emitter=light(3, 2.5, 2))
 
 
+def window_in_floor() -> mi.Scene:
+    """A pane that stands in a floor, and leans."""
+    floor = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "floor", bsdf=diffuse(0.7, two_sided=True))
+    wall = quad((-0.8, -0.6, 0.1), (0, 1.3, 0.25), (1.6, 0, 0.2), "pane", bsdf={"type": "thindielectric"})
+    return scene(sensor=camera((0.6, 1.2, -3.4), (0, 0, 0)), floor=floor, pane=wall, sky=constant(0.6))
+
+
+def glass_in_floor() -> mi.Scene:
+    """A block of glass that stands in a floor that shines."""
+    floor = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "floor", bsdf=diffuse(0.0), emitter=light(0.3, 0.2, 0.1))
+    block = cube((0, 0.15, 0.1), 0.6, bsdf={"type": "dielectric"})
+    return scene(sensor=camera((0.6, 1.2, -3.4), (0, 0, 0)), floor=floor, block=block, sky=constant(0.6))
+
+
 def before_bar(shape: dict) -> mi.Scene:
     at = camera((0.4, 0.8, -3.2), (0, 0.4, 0), fov=35)
     return scene(sensor=at, ball=shape, bar=bar(), sky=constant(0.2))
@@ -383,6 +397,8 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "two_mirrors": (two_mirrors, TURN, 3e-3, 4),
     "mirrored_cut": (mirrored_cut, SLIDE, 3e-3, 3),
     "mirrored_cut_sphere": (mirrored_cut_sphere, {"key": "ball.to_world", "direction": [1, 0.4, 0.3]}, 3e-3, 3),
+    "window_in_floor": (window_in_floor, CAMERA, 2e-3, 2),
+    "glass_in_floor": (glass_in_floor, CAMERA, 2e-3, 4),
     "pane": (pane, SLIDE, 2e-3, 5),
     "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),

@@ -23,7 +23,8 @@ EDGE_ON = 1e-6
 #: the angle between the faces: closer, rays through the mesh start beyond the other face.
 BEHIND = 8
 
-#: And beside those of meshes that rays go through as if nothing was there, in units of the offset of such rays.
+#: And beside those of meshes that rays go through as if nothing was there, and lines in which such cut others, in units
+#: of the offset of such rays. (At these lines, over the sine of the angle between both.)
 BESIDE_MASK = 2
 
 #: And beside lines in which shapes cut through each other, and inner edges of acute corners, in the same units, where
@@ -74,6 +75,8 @@ class DeviceEdges:
         shapes = (*geometry.known, *geometry.others)
         #: Is there a surface that lets rays through?
         self._any_through = any(lets_rays_through(s) for s in shapes)
+        #: And one that bends them, so that they start on its other side?
+        self._any_glass = any(bends_light(s) for s in shapes)
         self._any_split = bool((edges.vertices[:, 0] != edges.vertices[:, 1]).any())
         #: Are there edges made of sides that lie on one another (`close_cracks`), and of which parts of these?
         self._any_joined = bool(edges.joined.any())
@@ -281,8 +284,16 @@ class DeviceEdges:
         cotangent = dr.dot(first, second) / dr.norm(dr.cross(first, second))
         inside = dr.dot(dr.cross(first + second, self._along(positions, edge)), to_viewer) > 0
         wedge = dr.select(of(self._glass) & of(self._two_faces), dr.clip(cotangent, 0, 1), 0)
+        beyond = dr.select(of(self._mask), mi.Float(BESIDE_MASK), 0)
         if self._any_lines:
-            wedge = dr.select(of(self._is_line), self._overhang(positions, edge, p, to_viewer), BEHIND * wedge)
+            normals = self._normals_of_line(positions, edge, p, to_viewer)
+            below = overhang(*normals)
+            if self._any_glass:
+                below = dr.maximum(below, overhang(normals[0], -normals[1]))
+            wedge = dr.select(of(self._is_line), below, BEHIND * wedge)
+            if self._any_through:
+                through = BESIDE_MASK / dr.maximum(dr.norm(dr.cross(*normals)), 1 / BESIDE_LINE[1])
+                beyond = dr.select(of(self._is_line), through, beyond)
         else:
             wedge *= BEHIND
         farther = wedge * lift(scene, p) + self._crack(positions, edge)
@@ -296,17 +307,18 @@ class DeviceEdges:
         if self.curves is not None:
             curved, piece = self._piece(edge)
             farther += dr.select(curved, self.curves.blur(positions, piece, p, to_viewer), 0)
-        return dr.detach(farther + dr.select(of(self._mask), BESIDE_MASK * lift_beyond(scene, p), 0))
+        return dr.detach(farther + beyond * lift_beyond(scene, p))
 
-    def _overhang(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f) -> mi.Float:
-        """How far beside a line in which surfaces cut each other rays start below the other one, in units of the offset
-        of rays: see `BESIDE_LINE`."""
+    def _normals_of_line(
+        self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, to_viewer: mi.Vector3f
+    ) -> list[mi.Vector3f]:
+        """Of the two surfaces that cut each other in a line, towards the viewer."""
         normals, start = [mi.Vector3f(0), mi.Vector3f(0)], self._first_line
         for lines in self._lines:
             here, line = self._number(edge, start, lines.capacity)
             normals = [dr.select(here, m, n) for m, n in zip(lines.normals(positions, line, p), normals, strict=True)]
             start += lines.capacity
-        return overhang(*(dr.mulsign(n, dr.dot(n, to_viewer)) for n in normals))
+        return [dr.mulsign(n, dr.dot(n, to_viewer)) for n in normals]
 
     def is_smooth(self, edge: mi.UInt32) -> mi.Bool:
         """Are interpolated normals, and all else, the same on both sides?"""
