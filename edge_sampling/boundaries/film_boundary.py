@@ -103,6 +103,7 @@ class FilmBoundary:
     soft : are there lights with a size, or light that is scattered? Then a part of it may lie behind one face of a
         smooth-shaded mesh, but not behind the next, and what is seen jumps at the edge (see `face_planes.py`).
     seams : do the seams of the texture coordinates of spheres, disks and cylinders count?
+    channels : is it other channels than light that jump? Those of perfect mirrors do so at edges as well.
     """
 
     DRJIT_STRUCT = dict.fromkeys(("outlines", "lights", "veils"))  # for `dr.freeze`
@@ -117,10 +118,12 @@ class FilmBoundary:
         soft: bool,
         turning: np.ndarray | bool = False,
         seams: bool = False,
+        channels: bool = False,
     ):
         self.lights = lights
         self.veils = any(lets_rays_through(s) for s in (*geometry.known, *geometry.others))
-        self.outlines = FilmOutlines(geometry, edges, moving, turning, soft=soft, seams=seams)
+        which = {"soft": soft, "seams": seams, "channels": channels}
+        self.outlines = FilmOutlines(geometry, edges, moving, turning, **which)
 
     @property
     def edge_count(self) -> int:

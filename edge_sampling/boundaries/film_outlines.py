@@ -98,7 +98,7 @@ class FilmOutlines:
 
     Parameters
     ----------
-    geometry, edges, moving, turning, soft, seams : see `FilmBoundary`.
+    geometry, edges, moving, turning, soft, seams, channels : see `FilmBoundary`.
     """
 
     _PARTS = ("edges", "corners", "spreads", "dark", "matt", "horizons", "curves", "near_cuts", "lines", "grids")
@@ -113,6 +113,7 @@ class FilmOutlines:
         *,
         soft: bool,
         seams: bool,
+        channels: bool,
     ):
         self.geometry, self.soft = geometry, soft
         self.lines, self.grids, self.textures = geometry.lines, grids_of(geometry), geometry.textures
@@ -128,15 +129,15 @@ class FilmOutlines:
         known = [m.bsdf() if not is_grid(m) else None for m in geometry.meshes]
         of_mesh = edges.mesh[:, 0]
         spread = np.array([bsdf is not None and spreads(bsdf, FOUND_ELSEWHERE) for bsdf in known] or [False])
-        dark = np.array([bsdf is not None and not bsdf.flags() & mi.BSDFFlags.Smooth for bsdf in known] or [False])
+        is_dark = lambda bsdf: bsdf is not None and not channels and not bsdf.flags() & mi.BSDFFlags.Smooth
+        dark = np.array([is_dark(bsdf) for bsdf in known] or [False])
         self.spreads, self.dark = (mi.Bool(of[of_mesh]) if len(edges) else None for of in (spread, dark))
         #: And which on meshes that are matt, without lines? None where these have few creases, and there is little to
         #: gain.
         matt = np.array([bsdf is not None and is_matt(bsdf) for bsdf in known] or [False])
         matt = matt[edges.mesh].all(1)
-        if (
-            self.textures is not None
-        ):  # what jumps at creases along which there is a line is more than their angle tells
+        if self.textures is not None:
+            # What jumps at creases along which there is a line is more than their angle tells.
             matt &= ~np.isin(edges.mesh, list(self.textures.along_edges)).any(1)
         creases = matt & np.isin(edges.kind, (EdgeKind.FLAT, EdgeKind.SPLIT))
         self.matt = mi.Bool(matt) if creases.sum() >= FINE else None

@@ -36,7 +36,8 @@ from .meshes import (
     vertex_attributes,
 )
 from .parameters import Parameter
-from .texture_lines import SEAM_OF, is_even, jumps_at_seam, numbers_of_place, texture_values
+from .texture_lines import is_even, numbers_of_place, texture_values
+from .texture_seams import SEAM_OF, jumps_at_seam
 
 #: Vertices that were at the same place are apart if they differ by more than so many times the rounding error.
 APART = 64

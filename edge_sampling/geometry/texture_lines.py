@@ -37,6 +37,7 @@ from .meshes import (
     surfaces,
     texture_coordinates,
 )
+from .texture_seams import SEAM_OF, jumps_at_seam, texture_value
 
 #: The texture that shows a volume on a surface.
 VOLUME = "VolumeAdapter"
@@ -47,12 +48,6 @@ TEXTURE_UNIT_STEP = 1 / 256
 #: Texels at which a bitmap is looked at for such steps, places in each step, and the first texels of a row that are
 #: looked at: as far as single precision tells these places apart.
 TEXELS, PLACES_OF_STEP, FIRST_TEXELS = 1024, 8, 2048
-
-#: Shapes whose texture coordinates begin and end at a line, and which of both does: the azimuth.
-SEAM_OF = {"Sphere": 0, "Cylinder": 0, "Disk": 1}
-
-#: Points of such a line at which textures are compared.
-PLACES_OF_SEAM = 64
 
 #: Points at which a volume is looked at for its brightest and its darkest voxel.
 PLACES = 2**20
@@ -258,18 +253,6 @@ def lattices(shape: Any, light: mi.Emitter | None = None) -> list[Lattice]:
     return found
 
 
-def jumps_at_seam(texture: mi.Texture, shape: str) -> bool:
-    """Does a texture differ between both sides of the line at which the texture coordinates of a kind of shape begin
-    and end? Bitmaps do that do not repeat, and all that are scaled. shape : class name."""
-    if shape not in SEAM_OF:
-        return False
-    along = np.random.default_rng(0).uniform(0, 1, PLACES_OF_SEAM).astype(np.float32)
-    sides = [np.full_like(along, x) for x in (0, np.nextafter(np.float32(1), np.float32(0)))]
-    with dr.suspend_grad():
-        a, b = (np.array(_value(texture, mi.Point2f(*np.roll([s, along], SEAM_OF[shape], 0)))) for s in sides)
-    return bool(np.abs(a - b).max() > 1e-3 * np.abs([a, b]).max())
-
-
 def jumps_at_every_edge(mesh: Any) -> bool:
     """Does something jump wherever two faces of the mesh meet? Attributes of faces; textures without texture
     coordinates, for which the place inside of its own triangle stands; and what depends on the tangents of a face:
@@ -287,16 +270,24 @@ def jumps_at_every_edge(mesh: Any) -> bool:
     return not has_texcoords(mesh) and any(has_place(o) for o in objects)
 
 
-def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
+def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = (), *, seams: bool = True) -> list[str]:
     """Names of what jumps inside of faces: checkerboards, bitmaps with the `nearest` filter, bump maps (where a bitmap
     is continuous, its slope jumps at every texel), and volumes that jump between their voxels.
 
     besides : shapes whose textures are not asked for, but for volumes, whose jumps are not known as lines.
+    seams : do those count that jump where the texture coordinates of a sphere begin and end?
     """
     below = lambda owners: {id(o): o for owner in owners for o in objects_below(owner).values()}
     # A scene file may define materials, or wrap them, that no shape refers to.
     used = below((*surfaces(scene), *scene.emitters()))
     known = [k for k, o in below(besides).items() if o.class_name() != VOLUME]
+    at_seam = [
+        id(o)
+        for s in surfaces(scene)
+        if seams and s.class_name() in SEAM_OF
+        for o in objects_below(s).values()
+        if has_place(o) and jumps_at_seam(o, s.class_name())
+    ]
     box = box_around(scene)
     uv = [texture_coordinates(m) for m in Geometry.of(scene).meshes if has_texcoords(m)]
     uv = np.concatenate([np.zeros((0, 2)), *uv])
@@ -307,7 +298,7 @@ def jumping_textures(scene: mi.Scene, besides: Sequence[Any] = ()) -> list[str]:
         and id(o) not in known
         and (
             (isinstance(o, mi.BSDF) and o.class_name() == "BumpMap")
-            or (has_place(o) and _jumps(o, *_range(o, uv)))
+            or (has_place(o) and (id(o) in at_seam or _jumps(o, *_range(o, uv))))
             or (o.class_name() == VOLUME and box.valid() and _jumps(o, list(box.min), list(box.max)))
         )
     ]
@@ -338,19 +329,10 @@ def _in_steps(texture: mi.Texture) -> bool:
     apart = TEXTURE_UNIT_STEP / PLACES_OF_STEP * np.arange(2 * PLACES_OF_STEP + 1)
     uv = _from_texture(texture, ((corners[:, None] + apart[:, None]) / size).reshape(-1, 2))
     with dr.suspend_grad():
-        values = np.array(_value(texture, mi.Point2f(uv.T.astype(np.float32)))).reshape(-1, TEXELS, len(apart))
+        values = np.array(texture_value(texture, mi.Point2f(uv.T.astype(np.float32)))).reshape(-1, TEXELS, len(apart))
     same = (np.diff(values, axis=2) == 0).all(0)  # in all channels
     varies = ~same.all(1)
     return bool(varies.any() and same[varies].mean() > 0.5)
-
-
-def _value(texture: Any, at: mi.Point2f | mi.Point3f) -> mi.Spectrum:
-    """At texture coordinates, or in space."""
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(at))
-    if mi.is_spectral:
-        si.wavelengths = type(si.wavelengths)(550)
-    setattr(si, "uv" if isinstance(at, mi.Point2f) else "p", at)
-    return texture.eval(si)
 
 
 def texture_values(texture: mi.Texture) -> list[Any]:
@@ -395,7 +377,7 @@ def _bisected(texture: Any, lower: list[float], upper: list[float], pairs: int =
     """
     in_space = len(lower) == 3
     ends = np.random.default_rng(0).uniform(lower, upper, (pairs, 2, len(lower)))
-    value = partial(_value, texture)
+    value = partial(texture_value, texture)
     with dr.suspend_grad():
         extremes = _brightest_and_darkest_in_space(texture, value) if in_space else _brightest_and_darkest(texture)
         ends = np.concatenate([ends, extremes]).astype(np.float32)

@@ -54,7 +54,7 @@ class ChannelSearch(BoundarySearch):
         if on_film.any():
             # Where normals of faces are shown, edges of smooth-shaded meshes count, in proportion to their bend.
             seams = bool(self.kinds & {"uv", "albedo"})
-            which = {"soft": "geo_normal" in self.kinds, "seams": seams}
+            which = {"soft": "geo_normal" in self.kinds, "seams": seams, "channels": True}
             edges = self._jumping(self._edges_of(self.geometry))
             film = FilmBoundary(self.geometry, edges, on_film, NoLights(), **which)
             film = film if any(film.outlines.counts) else None
@@ -83,7 +83,7 @@ class ChannelSearch(BoundarySearch):
                 f"the derivative of {labels} is taken to be 0, since numbers that name triangles and shapes have none. "
                 'Differentiate a mask in their place, "<name>:mask:<id of a shape>".'
             )
-        textures = jumping_textures(scene) if "albedo" in self.kinds else []
+        textures = jumping_textures(scene, seams=False) if "albedo" in self.kinds else []
         if textures:
             limits.append(
                 f"the derivative of the albedo lacks the jumps of the textures {', '.join(textures)}; use bilinear "

@@ -207,8 +207,8 @@ def appearance(
     textures = jumping_textures(scene, besides=(*surfaces(scene), *beams) if bisects else ())
     if textures:
         limits.append(
-            f"the derivative lacks the jumps of the textures {listed(textures)}; use bilinear bitmaps, and "
-            "normal maps for bump maps."
+            f"the derivative lacks the jumps of the textures {listed(textures)}; use bilinear bitmaps, "
+            "which repeat around spheres, and normal maps for bump maps."
         )
     mapped = names(s for s in moving.with_lines if has_normal_map(s))
     if mapped and not bisects:
@@ -226,8 +226,8 @@ def appearance(
         little = "" if any(s in moving.sliding for s in unknown) else ", which matter little if they are fine"
         limits.append(
             f"the derivative lacks, in the light that {listed(names(unknown))} throw on surfaces close to them, the "
-            f"jumps of their textures{little}; use bilinear bitmaps, or meshes with texture coordinates and at most "
-            f"{COARSE} lines across."
+            f"jumps of their textures{little}; use bilinear bitmaps that repeat, or meshes with texture coordinates "
+            f"and at most {COARSE} lines across."
         )
     lamps = names(
         s for s in moving.sliding if s.is_emitter() and s.emitter().flags() & mi.EmitterFlags.SpatiallyVarying

@@ -115,13 +115,13 @@ def test_far_plane_of_each_sensor():
 @pytest.fixture
 def in_steps(monkeypatch):
     """Bitmaps are looked up as the texture units of a GPU do it: places are rounded to 1/256 of a texel."""
-    exact = texture_lines._value
+    exact = texture_lines.texture_value
 
     def rounded(texture, at):
         size = np.array(texture.resolution(), float)
         return exact(texture, mi.Point2f(*(dr.round(x * n * 256) / (n * 256) for x, n in zip(at, size, strict=True))))
 
-    monkeypatch.setattr(texture_lines, "_value", rounded)
+    monkeypatch.setattr(texture_lines, "texture_value", rounded)
 
 
 def mapped_board(kind: str, name: str, inner: dict):
