@@ -68,11 +68,27 @@ def window_in_floor() -> mi.Scene:
     return scene(sensor=camera((0.6, 1.2, -3.4), (0, 0, 0)), floor=floor, pane=wall, sky=constant(0.6))
 
 
+def window_in_mirror() -> mi.Scene:
+    """Such a pane before a mirror, which shows the line in which it cuts the floor at a grazing angle."""
+    floor = quad((-2.5, 0, -2.5), (0, 0, 5), (5, 0, 0), "floor", bsdf=diffuse(0.0), emitter=light(0.3, 0.2, 0.1))
+    wall = quad((-0.8, -0.6, 0.1), (0, 1.3, 0.25), (1.6, 0, 0.2), "pane", bsdf={"type": "thindielectric"})
+    mirror = quad((-3, -1, 1.6), (0, 3, 0.1), (6, 0, 0), "mirror", bsdf={"type": "conductor"})
+    at = camera((0.6, 1.6, -3.4), (0, 0.5, 1))
+    return scene(sensor=at, floor=floor, mirror=mirror, pane=wall, sky=constant(0.6))
+
+
 def glass_in_floor() -> mi.Scene:
     """A block of glass that stands in a floor that shines."""
     floor = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "floor", bsdf=diffuse(0.0), emitter=light(0.3, 0.2, 0.1))
     block = cube((0, 0.15, 0.1), 0.6, bsdf={"type": "dielectric"})
     return scene(sensor=camera((0.6, 1.2, -3.4), (0, 0, 0)), floor=floor, block=block, sky=constant(0.6))
+
+
+def glass_ball_in_floor() -> mi.Scene:
+    """And a ball: the line in which it cuts the floor is seen from inside, too."""
+    floor = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "floor", bsdf=diffuse(0.0), emitter=light(0.3, 0.2, 0.1))
+    block = {"type": "sphere", "center": [0, 0.15, 0.1], "radius": 0.5, "bsdf": {"type": "dielectric"}}
+    return scene(sensor=camera((0.6, 1.2, -3.4), (0, 0, 0)), floor=floor, ball=block, sky=constant(0.6))
 
 
 def before_bar(shape: dict) -> mi.Scene:
@@ -398,7 +414,9 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "mirrored_cut": (mirrored_cut, SLIDE, 3e-3, 3),
     "mirrored_cut_sphere": (mirrored_cut_sphere, {"key": "ball.to_world", "direction": [1, 0.4, 0.3]}, 3e-3, 3),
     "window_in_floor": (window_in_floor, CAMERA, 2e-3, 2),
+    "window_in_mirror": (window_in_mirror, CAMERA, 2e-3, 4),
     "glass_in_floor": (glass_in_floor, CAMERA, 2e-3, 4),
+    "glass_ball_in_floor": (glass_ball_in_floor, CAMERA, 2e-3, 4),
     "pane": (pane, SLIDE, 2e-3, 5),
     "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),

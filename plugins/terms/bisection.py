@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 
 import drjit as dr
 import mitsuba as mi
@@ -18,12 +18,12 @@ from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart
 from rimlight.edge_sampling.boundaries.shown_shadows import Border
 from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
-from rimlight.edge_sampling.geometry.device_edges import BEHIND, overhang, rounding
+from rimlight.edge_sampling.geometry.device_edges import BEHIND, BESIDE_LINE, BESIDE_MASK, overhang, rounding
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity
 from rimlight.edge_sampling.projection.sensors import frame, inside_frame
-from rimlight.edge_sampling.rays import lift
+from rimlight.edge_sampling.rays import lift, lift_beyond
 from rimlight.transport.cut import Cut
 from rimlight.transport.film_chains import Chains, FilmRays, Parting, Seen, Segment
 from rimlight.transport.paths import Vertex
@@ -46,8 +46,9 @@ HIDDEN, HALVINGS = 4, 7
 #: Where nothing is found to jump in it after all, it is looked at once more, so many times as long.
 WIDE = 16
 
-#: Two surfaces meet if what both rays meet is at most so many times as far apart as the rays are, besides rounding.
-NEXT = 4
+#: Two surfaces meet if what both rays meet is at most so many times as far apart as the rays are, over the cosine at
+#: which they meet it, but at least the second number; besides rounding.
+NEXT, STEEPEST = 4, 0.02
 
 #: How far beside lines of textures to look, in units in the last place of the coordinates in which they are whole.
 BESIDE_TEXTURE = 64
@@ -227,9 +228,10 @@ def _beside(chains: Chains, at: Parting, segment: Segment, outline: tuple[Touch,
     aside = dr.zeros(mi.Float, dr.width(at.found))
     if outline is not None:
         touch, along, _ = outline
-        lifts = dr.select(_goes_in(at.a) | _goes_in(at.b), BEHIND, _overhang(at, segment))
-        aside = lifts * lift(chains.tracer.scene, at.a.ray(touch.t)) / dr.abs(along)
-        aside = dr.select(~at.on_texture & ~at.on_shadow & ~at.grazes, aside, 0)
+        scene, p = chains.tracer.scene, at.a.ray(touch.t)
+        of_glass = _goes_in(at.a) | _goes_in(at.b)
+        away = dr.select(of_glass, BEHIND * lift(scene, p), _beside_line(scene, at, segment, p))
+        aside = dr.select(~at.on_texture & ~at.on_shadow & ~at.grazes, away / dr.abs(along), 0)
     if chains.textures is not None:
         line, along, _ = _at_line(chains.tracer.scene, chains.textures, at)
         si = at.a.pi.compute_surface_interaction(at.a.ray, mi.RayFlags.All, at.found & at.on_texture)
@@ -256,14 +258,24 @@ def _at_shadow(chains: Chains, at: Parting, segment: Segment) -> Border:
     return chains.shown.border(chains.tracer.scene, a, b, segment.choice, active, at.on_cast_shadow)
 
 
-def _overhang(at: Parting, segment: Segment) -> mi.Float:
-    """Where both rays meet surfaces that touch each other: how far beside that line they start below the other one, in
-    units of the offset of rays."""
+def _beside_line(scene: mi.Scene, at: Parting, segment: Segment, p: mi.Point3f) -> mi.Float:
+    """Where both rays meet surfaces that touch each other, at about p: how far beside that line rays start that, closer
+    to it, would start below the other one. Scene units; see `DeviceEdges.farther`."""
     a, b = (v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, at.found) for v in (at.a, at.b))
     apart = segment.length * dr.norm(at.along.o + a.t * at.along.d)
-    meet = a.is_valid() & b.is_valid() & (dr.norm(a.p - b.p) <= NEXT * apart + rounding(a.p, at.a.ray.o))
-    normals = (dr.mulsign(si.n, -dr.dot(si.n, ray.d)) for si, ray in ((a, at.a.ray), (b, at.b.ray)))
-    return dr.select(meet, overhang(*normals), 0)
+    # Where they are met at a grazing angle, close rays meet points that are far apart.
+    cosine = dr.maximum(dr.minimum(dr.abs_dot(a.n, at.a.ray.d), dr.abs_dot(b.n, at.b.ray.d)), STEEPEST)
+    near = dr.norm(a.p - b.p) <= NEXT * apart / cosine + rounding(a.p, at.a.ray.o)
+    meet = a.is_valid() & b.is_valid() & near
+    n, m = (dr.mulsign(si.n, -dr.dot(si.n, ray.d)) for si, ray in ((a, at.a.ray), (b, at.b.ray)))
+    flags = [si.bsdf().flags() for si in (a, b)]
+    either = lambda kind: mi.has_flag(flags[0], kind) | mi.has_flag(flags[1], kind)
+    ways_in = mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission, mi.BSDFFlags.DiffuseTransmission
+    goes_in = reduce(operator.or_, map(either, ways_in))
+    below = dr.maximum(overhang(n, m), dr.select(goes_in, overhang(n, -m), 0))
+    through = BESIDE_MASK / dr.maximum(dr.norm(dr.cross(n, m)), 1 / BESIDE_LINE[1])
+    beyond = dr.select(either(mi.BSDFFlags.Null), through * lift_beyond(scene, p), 0)
+    return dr.select(meet, below * lift(scene, p) + beyond, 0)
 
 
 def _goes_in(vertex: Vertex) -> mi.Bool:
