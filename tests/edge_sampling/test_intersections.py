@@ -12,7 +12,7 @@ from building import CUBE_FACES, cube_vertices, diffuse, horizontal, mesh, quad,
 from random_scenes import ball, torus
 
 from rimlight.edge_sampling import Geometry, Intersections, find_welded_edges
-from rimlight.edge_sampling.geometry.device_edges import BESIDE_LINE, DeviceEdges
+from rimlight.edge_sampling.geometry.device_edges import BESIDE_LINE, DeviceEdges, overhang
 from rimlight.edge_sampling.geometry.rigid_motion import Shapes
 
 
@@ -250,5 +250,5 @@ def test_how_far_rays_beside_a_line_start_below_the_other_surface(angle, expecte
     device = DeviceEdges(edges, geometry)
     edge = count + dr.arange(mi.UInt32, lines.count)
     towards = mi.Vector3f(*map(float, 5 * axis(angle)))
-    found = device._overhang(geometry.positions(), edge, mi.Point3f(0), towards).numpy()
+    found = overhang(*device._normals_of_line(geometry.positions(), edge, mi.Point3f(0), towards)).numpy()
     np.testing.assert_allclose(found, BESIDE_LINE[0] * expected, atol=1e-5)
