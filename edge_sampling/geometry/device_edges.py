@@ -48,7 +48,7 @@ class DeviceEdges:
 
     # What a frozen function depends on (`dr.freeze`): every attribute that is read when sampling.
     _OF_EDGES = ("_ends", "_part", "_opposite", "_kind", "_two_faces", "_few_faces", "_is_line", "_glass", "_mask")
-    _ANY = ("any_smooth", "_any_lines", "_any_split", "_any_joined", "_any_through", "_first_line")
+    _ANY = ("any_smooth", "_any_glass", "_any_lines", "_any_split", "_any_joined", "_any_through", "_first_line")
     DRJIT_STRUCT = dict.fromkeys(("count", "_kinds", "curves", "_lines", "grids", *_ANY, *_OF_EDGES))
 
     def __init__(self, edges: Edges, geometry: Geometry):
