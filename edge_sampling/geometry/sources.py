@@ -9,7 +9,6 @@ of them part, and none meet, and the vertex normals of flat faces stay theirs.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -84,10 +83,11 @@ class Sources:
         dr.eval(self._differing)
         #: Lights and textures: by which arrays, and by which question, it is told whether something jumps.
         self._pictures = {e: (border_values, has_hard_beam) for e in scene.emitters() if e.class_name() in BEAMS}
-        round_ = [s for s in surfaces(scene) if s.class_name() in SEAM_OF]
-        of = {o: s.class_name() for s in round_ for o in objects_below(s).values() if has_place(o)}
-        closed = {o: partial(jumps_at_seam, shape=name) for o, name in of.items() if not jumps_at_seam(o, name)}
-        self._pictures |= {o: (texture_values, answer) for o, answer in closed.items()}
+        # (Two shapes may share a texture, and have their seams along different axes.)
+        of = {(o, s.class_name()) for s in surfaces(scene) for o in objects_below(s).values() if has_place(o)}
+        whole = {o for o, name in of if name in SEAM_OF and not jumps_at_seam(o, name)}
+        seams = lambda o: [name for p, name in of if p is o and jumps_at_seam(o, name)]
+        self._pictures |= dict.fromkeys(whole, (texture_values, seams))
         even = [o for o in objects_below(scene).values() if has_place(o) and is_even(o)]
         self._pictures |= dict.fromkeys(even, (texture_values, is_even))
         self._answers = {o: (values(o), answer(o)) for o, (values, answer) in self._pictures.items()}
