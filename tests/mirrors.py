@@ -68,6 +68,13 @@ def window_in_floor() -> mi.Scene:
     return scene(sensor=camera((0.6, 1.2, -3.4), (0, 0, 0)), floor=floor, pane=wall, sky=constant(0.6))
 
 
+def wall_in_water() -> mi.Scene:
+    """An upright wall in water that mirrors it: what is seen of it through the surface, and its image, coincide."""
+    water = quad((-1.5, 0, -1.5), (0, 0, 3), (3, 0, 0), "water", bsdf={"type": "thindielectric"})
+    wall = quad((-0.8, -0.6, 0.1), (0, 1.2, 0), (1.6, 0, 0.2), "wall", bsdf=diffuse(0.7, two_sided=True))
+    return scene(sensor=camera((0.6, 1.2, -3.4), (0, 0, 0)), water=water, wall=wall, sky=constant(0.6))
+
+
 def window_in_mirror() -> mi.Scene:
     """Such a pane before a mirror, which shows the line in which it cuts the floor at a grazing angle."""
     floor = quad((-2.5, 0, -2.5), (0, 0, 5), (5, 0, 0), "floor", bsdf=diffuse(0.0), emitter=light(0.3, 0.2, 0.1))
@@ -414,6 +421,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "mirrored_cut": (mirrored_cut, SLIDE, 3e-3, 3),
     "mirrored_cut_sphere": (mirrored_cut_sphere, {"key": "ball.to_world", "direction": [1, 0.4, 0.3]}, 3e-3, 3),
     "window_in_floor": (window_in_floor, CAMERA, 2e-3, 2),
+    "wall_in_water": (wall_in_water, CAMERA, 2e-3, 3),
     "window_in_mirror": (window_in_mirror, CAMERA, 2e-3, 4),
     "glass_in_floor": (glass_in_floor, CAMERA, 2e-3, 4),
     "glass_ball_in_floor": (glass_ball_in_floor, CAMERA, 2e-3, 4),

@@ -491,6 +491,12 @@ MUTANTS = [
         "[s for s in at_rest if not is_mapped_mirror(s)]",
         "list(at_rest)",
     ),
+    mutant(
+        "film boundary: what veils before an edge mirror counts there",
+        "edge_sampling/boundaries/film_boundary.py",
+        "        if not self.veils:\n            return None\n        per_unit",
+        "        if True:\n            return None\n        per_unit",
+    ),
 ]
 
 

@@ -34,10 +34,10 @@ from .grid_outlines import on_grids
 from .horizon import BESIDE, Horizon
 from .lune import Lune
 from .tracer import Tracer
-from .veils import behind_veils, is_veil
+from .veils import Before, behind_veils, is_veil
 
-#: A line of a texture is seen if what both rays meet is at most so many times as far from its plane as they are beside
-#: it.
+#: A line of a texture is seen, and what an outline belongs to is met, if what both rays meet is at most so many times as
+#: far from its plane as they are beside it.
 BENT = 4
 
 #: What perfect mirrors do, and all that lets light through.
@@ -73,6 +73,7 @@ class BoundaryPoints:
     active   : mi.Bool, (N,)
     horizons : on which side of a horizon of interpolated normals each of the rays is; None where there are none.
     directions : from where light is looked for on both sides, where it is active; None: as everywhere.
+    before   : what lies before the edge; None where there are no veils.
     sensor_moves : does the velocity depend on parameters of the sensor?
     aperture_sample : see `Projection.film`.
     """
@@ -86,6 +87,7 @@ class BoundaryPoints:
     active: mi.Bool
     horizons: list[Horizon | None]
     directions: Directions | None
+    before: Before | None
     sensor_moves: bool
     aperture_sample: mi.Point2f | None
 
@@ -154,7 +156,8 @@ class FilmBoundary:
             jump, alpha_jump, seen = mi.Spectrum(0), mi.Float(0), []
             sides = zip((-1, 1), points.rays, points.met, points.weights, points.horizons, strict=True)
             for sign, ray, pi, weight, horizon in sides:
-                L, alpha = tracer.seen(ray, pi, sampler.clone(), points.active, horizon, points.directions)
+                directions, before = points.directions, points.before
+                L, alpha = tracer.seen(ray, pi, sampler.clone(), points.active, horizon, directions, before)
                 seen.append(sign * L * weight)
                 jump -= seen[-1]
                 alpha_jump -= sign * alpha
@@ -221,7 +224,8 @@ class FilmBoundary:
             shared = self._lune(at, chosen, lights, p, rays, met)
             if tracer.shares_directions:
                 shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
-            sees = met, weights, active, horizons, shared, at.projection.attached, at.aperture_sample
+            before = self._before(at, p, rays[0].o, around)
+            sees = met, weights, active, horizons, shared, before, at.projection.attached, at.aperture_sample
             return BoundaryPoints(beside, n_dl, velocity, rays, *sees)
 
     def _look(self, tracer: Tracer, at: Placed, sensor: mi.Sensor, u: mi.Point2f, active: mi.Bool) -> tuple:
@@ -238,6 +242,13 @@ class FilmBoundary:
         if not self.veils:
             return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         return behind_veils(scene, ray, pi, tuple(g.inner for g in self.outlines.grids), active)
+
+    def _before(self, at: Placed, p: mi.Point3f, o: mi.Point3f, around: mi.Float) -> Before | None:
+        """See `BoundaryPoints`. around : how far beside the points p rays from o look, pixels."""
+        if not self.veils:
+            return None
+        per_unit = at.projection.pixels_per_unit(at.projection.film(p))
+        return Before(p, rounding(p, o) + BENT * around / per_unit)
 
     def _lune(self, at: Placed, chosen: Chosen, lights: mi.Vector4f | None, p, rays, met) -> Lune | None:
         """See `FilmOutlines.lune`; not of edges that are seen through a veil, from which light goes on to them."""

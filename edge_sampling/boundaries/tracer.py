@@ -15,6 +15,7 @@ from rimlight.edge_sampling.parametrisation import Turning, Vicinity
 from .crease import Directions
 from .horizon import Horizon
 from .lune import Lune
+from .veils import Before
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,11 @@ class Tracer(Protocol):
         active: mi.Bool,
         horizon: Horizon | None,
         directions: Directions | None,
+        before: Before | None = None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, of which the first hit, `pi`, is on a side of a horizon. Where there is
         a lune, only light from there need be reflected: what else there is does not jump. At a crease, light is looked
-        for in its directions."""
+        for in its directions. Of veils before an outline, only what they let through."""
 
     def scattered(
         self,

@@ -39,6 +39,26 @@ def behind_veils(
 
 
 @dataclass
+class Before:
+    """What lies before a point of an outline, as the camera sees it. (A Dr.Jit structure: not frozen.)
+
+    A veil before it lets the light through that jumps there. What the veil mirrors or scatters itself does not jump
+    there, but where something lies by symmetry: an upright wall in water, and its reflection, end at one line of the
+    film, though the outlines of both are found one by one.
+
+    p : the point, world space. slack : so far from it, what the outline belongs to may be met, scene units.
+    """
+
+    p: mi.Point3f
+    slack: mi.Float
+
+    def veils(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Bool:
+        """Is what a ray meets a veil before the point?"""
+        to_p = self.p - si.p
+        return is_veil(si) & (dr.dot(to_p, ray.d) > 0) & (dr.abs_dot(si.n, to_p) > self.slack)
+
+
+@dataclass
 class Veiled:
     """What veils let through of the light along rays that end.
 

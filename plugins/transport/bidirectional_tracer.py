@@ -11,6 +11,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.boundaries.tracer import Sender
+from rimlight.edge_sampling.boundaries.veils import Before
 
 from .bidirectional import CameraPaths
 from .emission import Around, Emission
@@ -74,7 +75,8 @@ class BidirectionalTracer(PathTracer):
 
     # ---------------------- The sides of boundaries ----------------------
 
-    # What comes from a lune is found by path tracing: its directions are not those of the BSDF.
+    # What comes from a lune is found by path tracing: its directions are not those of the BSDF. So is what veils before
+    # an outline let through.
 
     def radiance(
         self,
@@ -86,6 +88,7 @@ class BidirectionalTracer(PathTracer):
         horizon: Horizon | None = None,
         directions: Directions | None = None,
         pi: mi.PreliminaryIntersection3f | None = None,
+        before: Before | None = None,
     ) -> Radiance:
         if attached:
             return super().radiance(ray, sampler, active, attached=True, horizon=horizon, directions=directions, pi=pi)
@@ -98,12 +101,15 @@ class BidirectionalTracer(PathTracer):
                 self.fine_mirrors.turn(si, ray, active)
 
         by_path = active & directions.active if directions is not None else None
+        if before is not None:
+            veiled = active & before.veils(pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active), ray)
+            by_path = veiled if by_path is None else by_path | veiled
         others = active & ~by_path if by_path is not None else active
         found = self._connected(camera_vertex(ray, pi), sampler.clone(), others, turn, shines=True)
         L, valid = found[0], found[1] | (others & (self.scene.environment() is not None and not self.hide_emitters))
         if by_path is not None:
-            options = {"attached": False, "horizon": horizon, "directions": directions, "pi": pi}
-            other = super().radiance(ray, sampler, by_path, **options)
+            options = {"horizon": horizon, "directions": directions, "pi": pi, "before": before}
+            other = super().radiance(ray, sampler, by_path, attached=False, **options)
             L, valid = dr.select(by_path, other.L, L), valid | (by_path & other.valid)
         return Radiance(L, valid)
 

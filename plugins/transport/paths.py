@@ -11,6 +11,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
+from rimlight.edge_sampling.boundaries.veils import Before
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.geometry.meshes import is_met
 from rimlight.edge_sampling.parametrisation import Vicinity
@@ -62,6 +63,7 @@ def scattered_light(
     lights: LightChoice | None = None,
     fine_mirrors: FineMirrors | None = None,
     horizon: Horizon | None = None,
+    before: Before | None = None,
 ) -> tuple[mi.Spectrum, mi.Bool]:
     """Light that arrives by way of a vertex.
 
@@ -71,6 +73,7 @@ def scattered_light(
     lights : see `Scattering`.
     fine_mirrors : of which the normals are turned at this vertex.
     horizon : on which side of the horizon of interpolated normals this vertex is; None: as it is.
+    before : what veils scatter is left out, if this vertex, or what is seen through it, is one before that.
 
     Returns
     -------
@@ -91,6 +94,9 @@ def scattered_light(
         there = directions.where(active & (vertex.depth == first)) if directions is not None else None
         numbers = scattering.draw(sampler, active)
         direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), numbers, active, directions=there)
+        if before is not None:
+            lost = (vertex.depth == first) & before.veils(si, vertex.ray) & ~onwards.through
+            direct, onwards.weight = (dr.select(lost, 0, v) for v in (direct, onwards.weight))
         L += dr.select(active, vertex.β * direct, 0)
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)
         stopped |= (active & ~onwards.through) | scattering.stops(onwards.ray, onwards.pi, sampler, last)

@@ -12,6 +12,7 @@ from rimlight.edge_sampling.boundaries.crease import Directions
 from rimlight.edge_sampling.boundaries.fine_mirrors import FineMirrors
 from rimlight.edge_sampling.boundaries.horizon import Horizon, turn_to_side, turn_to_viewer
 from rimlight.edge_sampling.boundaries.tracer import ShadingPoint
+from rimlight.edge_sampling.boundaries.veils import Before
 from rimlight.edge_sampling.choice.light_choice import LightChoice
 from rimlight.edge_sampling.divided_light import DividedLight
 from rimlight.edge_sampling.first_points import FirstPoints, seen_by_camera
@@ -86,9 +87,11 @@ class PathTracer:
         directions: Directions | None = None,
         pi: mi.PreliminaryIntersection3f | None = None,
         stretch: mi.Float | float = 1.0,
+        before: Before | None = None,
     ) -> Radiance:
         """Estimate the radiance along camera rays.
 
+        before : what veils before it scatter is left out; None: nothing is.
         pi : their first hits, if these are known. stretch : see `FirstPoints.stretch`.
         horizon : on which side of the horizon of interpolated normals the first hit is; None: as it is.
         directions : see `Scattering.scatter`, for the first hit.
@@ -121,6 +124,9 @@ class PathTracer:
         direct, onwards = scattering.scatter(
             si, bsdf, scattering.draw(sampler, active), active, vicinity, directions=directions
         )
+        if before is not None:
+            lost = before.veils(si, ray) & ~onwards.through
+            direct, onwards.weight = (dr.select(lost, 0, v) for v in (direct, onwards.weight))
         with dr.resume_grad(when=attached):
             L += direct * stretch
         valid = backdrop | (active & ~onwards.through)
@@ -135,7 +141,8 @@ class PathTracer:
                 start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight * stretch))
             chosen = self.lights, self.lamps
             return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, *chosen))
-        indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, lights=self.lights)
+        beyond = {"lights": self.lights, "before": before}
+        indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, **beyond)
         return Radiance(L + dr.select(β != 0, indirect, 0), valid | (onwards.through & stopped))
 
     def first_hit(self, ray: mi.Ray3f, active: mi.Bool | bool) -> mi.PreliminaryIntersection3f:
@@ -170,9 +177,11 @@ class PathTracer:
         active: mi.Bool,
         horizon: Horizon | None,
         directions: Directions | None,
+        before: Before | None = None,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Radiance and alpha along camera rays, detached."""
-        found = self.radiance(ray, sampler, active, attached=False, horizon=horizon, directions=directions, pi=pi)
+        of_side = {"horizon": horizon, "directions": directions, "pi": pi, "before": before}
+        found = self.radiance(ray, sampler, active, attached=False, **of_side)
         return found.L, dr.select(found.valid, mi.Float(1), 0)
 
     # ---------------------- From points of a path ----------------------
