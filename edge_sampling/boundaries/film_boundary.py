@@ -36,8 +36,8 @@ from .lune import Lune
 from .tracer import Tracer
 from .veils import Before, behind_veils, is_veil
 
-#: A line of a texture is seen, and what an outline belongs to is met, if what both rays meet is at most so many times as
-#: far from its plane as they are beside it.
+#: A line of a texture is seen, and what an outline belongs to is met, if what both rays meet is at most so many times
+#: as far from its plane as they are beside it.
 BENT = 4
 
 #: What perfect mirrors do, and all that lets light through.
