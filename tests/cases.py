@@ -36,7 +36,7 @@ from grids import GRIDS, LONGER
 from hidden_lights import HIDDEN
 from instances import INSTANCES
 from joints import JOINTS
-from leaves import LEAVES
+from leaves import LEAVES, SEEN_THROUGH
 from mirrors import MIRRORS, ball_of_index
 from polished import POLISHED
 from random_scenes import ball
@@ -977,6 +977,7 @@ CASES = [
         for k, (*of, depth) in SLIDING.items()
     ),
     *(Case(k, *of, spp=256, runs=24, integrator=upto(depth), reference_spp=1024) for k, (*of, depth) in LEAVES.items()),
+    *(Case(k, *of, spp=64, runs=16, integrator=upto(depth)) for k, (*of, depth) in SEEN_THROUGH.items()),
     *(
         Case(k, *of, spp=256, runs=16, integrator=upto(depth), reference_spp=4096)
         for k, (*of, depth) in POLISHED.items()

@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
+from random_scenes import ball
 
 
 def opacity(filter_type: str, lowest: float, highest: float) -> dict:
@@ -85,6 +86,35 @@ def behind_leaf(floor: Callable[[], dict] = lambda: diffuse(0.7), **more: Callab
     return build
 
 
+def coarse_ball(bsdf: Callable[[], dict], **before: Callable[[], dict]) -> Callable[[], mi.Scene]:
+    """A coarse smooth-shaded ball in the sun, before a wall that glows. before : what it is seen through."""
+
+    def build() -> mi.Scene:
+        points, *_, faces = ball(4)
+        turned = np.array(mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 37).matrix)[:3, :3]
+        centred = 0.6 * points @ turned.T + [0, 0.4, 0]
+        return scene(
+            sensor=camera((0.6, 1.2, -3.4), (0, 0.4, 0), fov=35),
+            ball=mesh("ball", centred, faces, normals=True, bsdf=bsdf()),
+            wall=quad((-2, -1, 1.5), (4, 0, 0), (0, 3, 0), "wall", bsdf=diffuse(0), emitter=light(0.4, 0.3, 0.2)),
+            sun={"type": "directional", "direction": [0.5, -1, 0.7], "irradiance": {"type": "rgb", "value": 3.0}},
+            sky=constant(0.3),
+            **{k: v() for k, v in before.items()},
+        )
+
+    return build
+
+
+def pane() -> dict:
+    T = mi.ScalarTransform4f
+    to_world = T().translate([0.3, 1, -2]).rotate([1, 0, 0], -15).scale(2)
+    return {"type": "rectangle", "id": "pane", "to_world": to_world, "bsdf": {"type": "thindielectric"}}
+
+
+def thin_cloth() -> dict:
+    return {"type": "mask", "opacity": 0.6, "nested": diffuse(0.7, two_sided=True)}
+
+
 def ceiling() -> mi.Mesh:
     return horizontal((-0.6, 3.5, 0.4), 0.4, "lamp", down=True, emitter=light(14, 12, 10))
 
@@ -105,6 +135,7 @@ def checkers() -> dict:
 CUBE = {"key": "cube.vertex_positions", "direction": [0.2, 0.3, 1]}
 GLOW = {"key": "glow.vertex_positions", "direction": [0.2, 0.3, 1]}
 MOVES = {"key": "leaf.to_world", "direction": [0.2, 0.3, 1]}
+BALL = {"key": "ball.vertex_positions", "direction": [1, 0.3, 0.2]}
 CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.4]}
 OPACITY = {"key": "leaf.bsdf.opacity.data", "direction": [1]}
 
@@ -119,4 +150,10 @@ LEAVES: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "leaf_shadow": (beside_leaf(leaf, wall=lit_wall, point=point), CUBE, 4e-2, 4),
     "behind_veil_point": (behind_leaf(lamp=point_above), CUBE, 4e-3, 4),
     "behind_veil_checkers": (behind_leaf(floor=checkers, lamp=ceiling), CAMERA, 4e-3, 4),
+}
+
+#: The same, of what the camera sees through veils, with less noise.
+SEEN_THROUGH: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
+    "coarse_behind_pane": (coarse_ball(lambda: diffuse(0.7), pane=pane), BALL, 2e-3, 3),
+    "coarse_veil": (coarse_ball(thin_cloth), BALL, 2e-3, 3),
 }

@@ -14,8 +14,9 @@ outlines of spheres, disks, cylinders and tubes.
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +35,7 @@ from .grid_outlines import on_grids
 from .horizon import BESIDE, Horizon
 from .lune import Lune
 from .tracer import Tracer
-from .veils import Before, behind_veils, is_veil
+from .veils import Before, behind_veils
 
 #: A line of a texture is seen, and what an outline belongs to is met, if what both rays meet is at most so many times
 #: as far from its plane as they are beside it.
@@ -218,13 +219,18 @@ class FilmBoundary:
             beside, rest, n, n_dl, active = on_grids(outlines, at, look, chosen, found, u, p, n_dl, around, active)
             rays, weights = _beside(at, sensor, sampler, beside, (aside + rest * reach) * n, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
-            active &= self._jumps_between(scene, at, chosen, found, p, n, rays, met)
-            horizons = self._sides_of_horizons(at, chosen, found, p, rays, met)
-            n_dl = dr.select(active, n_dl * found.forward, 0)
-            shared = self._lune(at, chosen, lights, p, rays, met)
-            if tracer.shares_directions:
-                shared = self._shared_directions(chosen, shared, rays, met, horizons, active)
             before = self._before(at, p, rays[0].o, around)
+            sides = rays, met
+            if before is not None:
+                go_on = lambda ray, pi: behind_veils(scene, ray, pi, before.veils, active)
+                sides = zip(*map(go_on, rays, met), strict=True)
+            sides = [list(of) for of in sides]
+            active &= self._jumps_between(scene, at, chosen, found, p, n, *sides)
+            horizons = self._sides_of_horizons(at, chosen, found, p, *sides)
+            n_dl = dr.select(active, n_dl * found.forward, 0)
+            shared = outlines.lune(at, chosen, lights)
+            if tracer.shares_directions:
+                shared = self._shared_directions(chosen, shared, *sides, horizons, active)
             sees = met, weights, active, horizons, shared, before, at.projection.attached, at.aperture_sample
             return BoundaryPoints(beside, n_dl, velocity, rays, *sees)
 
@@ -239,27 +245,18 @@ class FilmBoundary:
 
     def _on_surface(self, scene: mi.Scene, ray, pi, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """What camera rays meet behind veils."""
-        if not self.veils:
-            return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-        return behind_veils(scene, ray, pi, tuple(g.inner for g in self.outlines.grids), active)
+        if self.veils:
+            no_grid = lambda si, ray: reduce(operator.and_, [si.shape != mi.ShapePtr(g.inner) for g in grids], True)
+            grids = self.outlines.grids
+            ray, pi = behind_veils(scene, ray, pi, no_grid, active)
+        return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
 
     def _before(self, at: Placed, p: mi.Point3f, o: mi.Point3f, around: mi.Float) -> Before | None:
         """See `BoundaryPoints`. around : how far beside the points p rays from o look, pixels."""
         if not self.veils:
             return None
         per_unit = at.projection.pixels_per_unit(at.projection.film(p))
-        return Before(p, rounding(p, o) + BENT * around / per_unit)
-
-    def _lune(self, at: Placed, chosen: Chosen, lights: mi.Vector4f | None, p, rays, met) -> Lune | None:
-        """See `FilmOutlines.lune`; not of edges that are seen through a veil, from which light goes on to them."""
-        lune = self.outlines.lune(at, chosen, lights)
-        if lune is None or not self.veils:
-            return lune
-        veiled = mi.Bool(False)
-        for ray, pi in zip(rays, met, strict=True):
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, lune.active)
-            veiled |= is_veil(si) & (dr.abs_dot(si.n, si.p - p) > rounding(p, ray.o))
-        return lune.where(~veiled)
+        return Before(p, rounding(p, o) + BENT * around / per_unit, mi.Bool(True))
 
     def _shared_directions(
         self, chosen: Chosen, lune: Lune | None, rays, met, horizons, active: mi.Bool

@@ -22,7 +22,7 @@ t is held: a point of a smooth surface that is on its outline moves over the fil
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -57,6 +57,10 @@ class Horizon:
     p: mi.Point3f
     on_curve: mi.Bool
     reach: mi.Float
+
+    def where(self, active: mi.Bool) -> Horizon:
+        """The same, on a side at most there."""
+        return replace(self, side=dr.select(active, self.side, 0))
 
 
 @dataclass

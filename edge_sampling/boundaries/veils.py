@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -20,22 +21,23 @@ def is_veil(si: mi.SurfaceInteraction3f) -> mi.Bool:
 
 
 def behind_veils(
-    scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, besides: tuple[mi.Shape, ...], active: mi.Bool
-) -> mi.SurfaceInteraction3f:
-    """What rays meet behind all veils but some. pi : what they meet first. Detached."""
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    passed: Callable[[mi.SurfaceInteraction3f, mi.Ray3f], mi.Bool],
+    active: mi.Bool,
+) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
+    """The rays that go on behind veils, and what they meet. pi : what they meet first. passed : which veils. Detached."""
 
     def go_on(ray, pi, active):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-        through = active & is_veil(si)
-        for shape in besides:
-            through &= si.shape != mi.ShapePtr(shape)
+        through = active & is_veil(si) & passed(si, ray)
         ray = dr.select(through, mi.Ray3f(spawn_ray(scene, si, ray.d, True)), ray)
         beyond = scene.ray_intersect_preliminary(ray, active=through)
         return ray, dr.select(through, beyond, pi), through & beyond.is_valid()
 
     state = (mi.Ray3f(ray), mi.PreliminaryIntersection3f(pi), active & pi.is_valid())
-    ray, pi, _ = dr.while_loop(state, lambda *state: state[-1], go_on, label="behind veils")
-    return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+    return dr.while_loop(state, lambda *state: state[-1], go_on, label="behind veils")[:2]
 
 
 @dataclass
@@ -47,15 +49,21 @@ class Before:
     film, though the outlines of both are found one by one.
 
     p : the point, world space. slack : so far from it, what the outline belongs to may be met, scene units.
+    active : mi.Bool, do rays go towards it?
     """
 
     p: mi.Point3f
     slack: mi.Float
+    active: mi.Bool
 
     def veils(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Bool:
         """Is what a ray meets a veil before the point?"""
         to_p = self.p - si.p
-        return is_veil(si) & (dr.dot(to_p, ray.d) > 0) & (dr.abs_dot(si.n, to_p) > self.slack)
+        return self.active & is_veil(si) & (dr.dot(to_p, ray.d) > 0) & (dr.abs_dot(si.n, to_p) > self.slack)
+
+    def where(self, active: mi.Bool) -> Before:
+        """The same, active at most there."""
+        return replace(self, active=self.active & active)
 
 
 @dataclass

@@ -18,11 +18,10 @@ from rimlight.edge_sampling import (
     maps_in_steps,
     objects_below,
 )
-from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
 from rimlight.edge_sampling.geometry.boxes import box_of
 from rimlight.edge_sampling.geometry.grids import grids_of
-from rimlight.edge_sampling.geometry.meshes import has_normal_map, inner, lets_rays_through, surfaces, vertices
+from rimlight.edge_sampling.geometry.meshes import has_normal_map, inner, lets_rays_through, surfaces
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others, cuts_of_tubes
 from rimlight.edge_sampling.geometry.texture_edges import COARSE
 from rimlight.edge_sampling.geometry.texture_lines import TEXTURE_UNIT_STEP, lattices
@@ -31,7 +30,7 @@ from rimlight.edge_sampling.rays import extent
 from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
-from ._coarse_limits import FRINGE, coarse_lamps, coarse_meshes
+from ._coarse_limits import coarse_lamps, coarse_meshes
 
 #: How much the radius of tubes may grow per length.
 STEEP = 0.05
@@ -155,32 +154,12 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
 def veils(scene: mi.Scene, *, from_points: bool) -> list[str]:
     """What lacks of what is seen through surfaces that rays go through as if nothing was there."""
     through = [s for s in surfaces(scene) if lets_rays_through(s)]
-    if through and not from_points:
-        return [
-            "the derivative lacks part of the motion of what is seen, and of what shines, through "
-            f'{listed(names(through))}; cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
-        ]
-    limits = []
-    coarse = names(s for s in surfaces(scene) if (s not in through or not is_flat(s)) and fringe(s) > FRINGE)
-    if coarse and through:
-        limits.append(
-            f"the derivative is off at the outlines of {listed(coarse)} that are seen through "
-            f"{listed(names(through))}: interpolated normals turn away from the sensor there. Give them finer "
-            "meshes or face normals."
-        )
-    return limits
-
-
-def is_flat(shape: Any) -> bool:
-    """Does it lie in one plane, so that nothing of it is seen through it?"""
-    if not shape.is_mesh():
-        return shape.class_name() == "Disk"
-    corners = vertices(shape).astype(np.float64)
-    return bool(np.linalg.matrix_rank(corners - corners.mean(0), tol=FLAT * np.ptp(corners, 0).max()) <= 2)
-
-
-#: How far the vertices of a mesh in one plane may be from it, relative to its size.
-FLAT = 1e-5
+    if not through or from_points:
+        return []
+    return [
+        "the derivative lacks part of the motion of what is seen, and of what shines, through "
+        f'{listed(names(through))}; cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
+    ]
 
 
 def shut_in_lamps(scene: mi.Scene, moving: Moving) -> list[str]:

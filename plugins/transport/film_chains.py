@@ -374,7 +374,9 @@ class Chains:
             if self.textures is not None:
                 # Where the camera sees it, the edge itself counts.
                 differ &= same_face | shown | ~self.textures.jump_at_edges(a.ray, a.pi, active)
-            on_line = active & ~parts & ~grazes & (differ | (here.dark != there.dark))
+            # So it does where a shadow begins at an edge, since one of both faces turns away from the light.
+            dark = (here.dark != there.dark) & (same_face | shown)
+            on_line = active & ~parts & ~grazes & (differ | dark)
             on_texture |= on_line & differ
             on_shadow |= on_line & ~differ
             found |= (active & (parts | grazes) & shown & ~self._starts_beyond(a, b)) | on_line

@@ -91,11 +91,12 @@ def scattered_light(
             turn_to_side(si, vertex.ray, horizon, vertex.depth == first)
         if fine_mirrors is not None:
             fine_mirrors.turn(si, vertex.ray, active & (vertex.depth == first))
-        there = directions.where(active & (vertex.depth == first)) if directions is not None else None
+        veiled = (vertex.depth == first) & before.veils(si, vertex.ray) if before is not None else mi.Bool(False)
+        there = directions.where(active & (vertex.depth == first) & ~veiled) if directions is not None else None
         numbers = scattering.draw(sampler, active)
         direct, onwards = scattering.scatter(si, si.bsdf(vertex.ray), numbers, active, directions=there)
         if before is not None:
-            lost = (vertex.depth == first) & before.veils(si, vertex.ray) & ~onwards.through
+            lost = veiled & ~onwards.through
             direct, onwards.weight = (dr.select(lost, 0, v) for v in (direct, onwards.weight))
         L += dr.select(active, vertex.β * direct, 0)
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)

@@ -121,11 +121,15 @@ class PathTracer:
         # ---------------------- Light that it scatters ----------------------
 
         vicinity = Vicinity.of(pi, self.slides) if attached and self.scatters(2) else None
+        there, veiled = directions, None
+        if before is not None:
+            veiled = before.veils(si, ray)
+            there = directions.where(~veiled) if directions is not None else None
         direct, onwards = scattering.scatter(
-            si, bsdf, scattering.draw(sampler, active), active, vicinity, directions=directions
+            si, bsdf, scattering.draw(sampler, active), active, vicinity, directions=there
         )
         if before is not None:
-            lost = before.veils(si, ray) & ~onwards.through
+            lost = veiled & ~onwards.through
             direct, onwards.weight = (dr.select(lost, 0, v) for v in (direct, onwards.weight))
         with dr.resume_grad(when=attached):
             L += direct * stretch
@@ -141,8 +145,11 @@ class PathTracer:
                 start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight * stretch))
             chosen = self.lights, self.lamps
             return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, *chosen))
-        beyond = {"lights": self.lights, "before": before}
-        indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, **beyond)
+        options = {"lights": self.lights}
+        if before is not None:
+            beyond = {"before": before, "horizon": horizon, "directions": directions}
+            options |= {k: v.where(veiled & onwards.through) for k, v in beyond.items() if v is not None}
+        indirect, stopped = scattered_light(scene, sampler, second, self.depths, active, **options)
         return Radiance(L + dr.select(β != 0, indirect, 0), valid | (onwards.through & stopped))
 
     def first_hit(self, ray: mi.Ray3f, active: mi.Bool | bool) -> mi.PreliminaryIntersection3f:
