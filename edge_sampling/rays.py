@@ -111,11 +111,14 @@ def extent(scene: mi.Scene) -> tuple[float, float]:
     return (math.dist(lower, upper), reach) if box.valid() and math.isfinite(reach) else (math.inf, 0.0)
 
 
+def rough_size(scene: mi.Scene) -> float:
+    """Diagonal of the scene, up to the next power of two, so that a scene that changes keeps its kernels."""
+    return _power_of_two(extent(scene)[0])
+
+
 def _size_if_small(scene: mi.Scene) -> float | None:
-    """Diagonal of the scene, up to the next power of two, so that a scene that changes keeps its kernels; None: nowhere
-    is the usual offset too large."""
-    size, reach = extent(scene)
-    size = _power_of_two(size)
+    """See `rough_size`. None: nowhere is the usual offset too large."""
+    size, reach = rough_size(scene), extent(scene)[1]
     return size if 0 < size < 1 + reach else None
 
 

@@ -42,6 +42,7 @@ from polished import POLISHED
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
 from sliding_textures import SLIDING, unsampled_lamp
+from tidy import TIDY
 from touching_lamps import TOUCHING
 from wires import WIRES
 
@@ -978,6 +979,7 @@ CASES = [
     ),
     *(Case(k, *of, spp=256, runs=24, integrator=upto(depth), reference_spp=1024) for k, (*of, depth) in LEAVES.items()),
     *(Case(k, *of, spp=64, runs=16, integrator=upto(depth)) for k, (*of, depth) in SEEN_THROUGH.items()),
+    *(Case(k, *of, spp=64, runs=8) for k, of in TIDY.items()),
     *(
         Case(k, *of, spp=256, runs=16, integrator=upto(depth), reference_spp=4096)
         for k, (*of, depth) in POLISHED.items()

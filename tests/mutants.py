@@ -497,6 +497,30 @@ MUTANTS = [
         "        if not self.veils:\n            return None\n        per_unit",
         "        if True:\n            return None\n        per_unit",
     ),
+    mutant(
+        "film boundary: lines of textures count below what stands on them",
+        "edge_sampling/boundaries/film_boundary.py",
+        "hidden |= (bent > 0) & ~_go_on(*surfaces)",
+        "hidden |= mi.Bool(False)",
+    ),
+    mutant(
+        "edges: things side by side keep edges of their own",
+        "edge_sampling/geometry/cracks.py",
+        "edges.open | _beside_others(geometry, edges)",
+        "edges.open",
+    ),
+    mutant(
+        "shadows from lights: all edges in one plane with the light count",
+        "edge_sampling/boundaries/fallen_shadow.py",
+        "active &= ~_in_front(scene, light, edge, aside, active)",
+        "active &= mi.Bool(True)",
+    ),
+    mutant(
+        "shadows from lights: those that end at an edge count",
+        SHADOWS,
+        "active &= on_both_sides(tracer, projection, sensor, view, shadow, n_dl, active)",
+        "active &= mi.Bool(True)",
+    ),
 ]
 
 

@@ -60,6 +60,7 @@ SPECIAL = {
     "parameters": "their materials have all kinds of values, and any parameters change (`random_parameters.py`)",
     "mirrors": "perfect mirrors and glass show what points, spots and suns light (`random_mirrors.py`)",
     "patterns": "mirrors, glass and what shines have textures and maps (`random_patterns.py`)",
+    "tidy": "all is upright and in line, things stand on each other, walls are mirrors or panes (`random_tidy.py`)",
     "meshes": "things are torn, turned round, cut through themselves, or one of many faces (`random_meshes.py`)",
     "polished": "most surfaces are polished: their highlights are narrow",
     "textures": "nearly everything has textures, most of them fine (`random_textures.py`)",
@@ -67,7 +68,7 @@ SPECIAL = {
     "rooms": "they are rooms, in which things touch the floor, walls and each other (`random_rooms.py`)",
 }
 #: Those whose mirrors show what lights without size light, if paths are long enough.
-SHOWN = ("mirrors", "patterns")
+SHOWN = ("mirrors", "patterns", "tidy")
 
 MIRRORS = ("conductor", "plastic", "thindielectric", "dielectric")
 
@@ -222,10 +223,11 @@ class Generator:
         kinds: list[str] = []
         for i in range(self.rng.integers(1, 3)):
             kinds.append(self.make_light(i, kinds))
-        skies = self.special == "jumps" or (self.special == "patterns" and direct)
-        if skies and not {"sky", "environment"} & set(kinds):
-            # Without one, `path` drops light that comes through a mask or a thin glass; and mirrors show little.
-            self.objects["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}}
+        if self.special in ("jumps", "patterns", "tidy") and not {"sky", "environment"} & set(kinds):
+            # Without one, `path` drops light that comes through a mask or a thin glass; and mirrors show little. (But
+            # what these throw on other surfaces of a sky that shines is missing.)
+            radiance = 0.2 if direct or self.special == "jumps" else 0.0
+            self.objects["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
         scene = mi.load_dict(self.objects)
         params, move = self.make_motion(scene, cameras=not self.instances)
         return RandomScene(scene, params, move, integrator, depth, " ".join(self.labels))
@@ -522,7 +524,7 @@ class Generator:
     def make_light(self, i: int, before: list[str]) -> str:
         name = f"light{i}"
         of_special = {"beams": ("spot", "projector"), **dict.fromkeys(("textures", "mirrors"), HARD)}
-        of_special["patterns"] = LIGHTS if self.depth == 2 else HARD
+        of_special |= dict.fromkeys(("patterns", "tidy"), LIGHTS if self.depth == 2 else HARD)
         kind = self.pick(*of_special.get(self.special, LIGHTS))
         if kind in ("sky", "environment") and ({"sky", "environment"} & set(before) or self.instances):
             kind = "area"
@@ -669,6 +671,8 @@ def make(seed: int, sampler: str = "independent", home: bool = False, special: s
         from random_mirrors import MirrorGenerator as Kind
     elif special == "patterns":
         from random_patterns import PatternGenerator as Kind
+    elif special == "tidy":
+        from random_tidy import TidyGenerator as Kind
     elif special == "meshes":
         from random_meshes import MeshGenerator as Kind
     elif special == "files":

@@ -23,9 +23,10 @@ from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.parametrisation import in_plane, material_point
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
 
+from .fallen_shadow import LightPoint, LitEdge, fall
 from .past_edges import look, turning
 from .shading_boundary import density_from_points
-from .shadow_boundary import LightPoint, LitEdge, ShadowBoundary, fall
+from .shadow_boundary import ShadowBoundary
 from .tracer import LightTracer, ShadingPoint
 
 #: How far from the vertex of the light subpath the line past an edge may end, in units of what both ways

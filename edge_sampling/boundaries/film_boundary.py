@@ -41,6 +41,9 @@ from .veils import Before, behind_veils
 #: as far from its plane as they are beside it.
 BENT = 4
 
+#: And if there is at most 60° between the normals of both.
+LEAST_COSINE = 0.5
+
 #: What perfect mirrors do, and all that lets light through.
 STRAIGHT = int(mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)
 
@@ -286,6 +289,7 @@ class FilmBoundary:
             # A line of a texture may lie along an edge, beyond which is another plane.
             bent = BENT * outlines.beside_texture(at, chosen)
             hidden = outlines.edges.is_hidden(at.positions, chosen.edge, p, eye, view, rays, surfaces, bent)
+            hidden |= (bent > 0) & ~_go_on(*surfaces)
             grids = outlines.edges.grids
             if grids.any:
                 of = at.positions, at.normals, chosen.edge, found.t, p
@@ -383,6 +387,12 @@ class FilmBoundary:
         per_unit = projection.pixels_per_unit(projection.film(p))
         on_film = ulps * max(projection.crop_size + projection.crop_offset)
         return (ulps * largest + farther) * per_unit + on_film, reach * per_unit
+
+
+def _go_on(first: mi.SurfaceInteraction3f, second: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Are two points close by on one surface, and not one of them on something that stands on it?"""
+    one = (first.shape == second.shape) & (first.instance == second.instance)
+    return one & (dr.dot(first.n, second.n) > LEAST_COSINE)
 
 
 def _beside(at: Placed, sensor: mi.Sensor, sampler: mi.Sampler, u, offset, active) -> tuple[list, list]:

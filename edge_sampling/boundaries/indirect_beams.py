@@ -18,8 +18,8 @@ from rimlight.edge_sampling.geometry.device_edges import rounding
 from rimlight.edge_sampling.geometry.texture_lines import lines_of_beam
 
 from .beam_lines import BeamLines
+from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow
 from .indirect_shadows import IndirectShadows
-from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow
 from .tracer import Tracer
 
 #: How far beside a line its sides are looked at, in units in the last place of the place on the picture.

@@ -26,7 +26,8 @@ from rimlight.edge_sampling.geometry.meshes import is_smooth, pointer
 from rimlight.edge_sampling.parametrisation import Vicinity, material_point
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
 
-from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow, ShadowBoundary, fall, thrown
+from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow, fall, thrown
+from .shadow_boundary import ShadowBoundary
 from .tracer import ShadingPoint, Tracer
 from .veils import Veiled, has_veils
 

@@ -27,8 +27,9 @@ from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.projection.sensors import Projection
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
+from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow, fall, look, thrown
 from .fine_mirrors import fringe
-from .shadow_boundary import LightPoint, LitEdge, SeenShadow, Shadow, ShadowSamples, fall, look, thrown
+from .shadow_boundary import ShadowSamples
 from .tracer import Tracer
 
 

@@ -25,15 +25,15 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.emitter_boxes import SLACK
 from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic
-from rimlight.edge_sampling.choice.silhouettes import OutlinePoint, Placement, Silhouettes
+from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Cone, View
-from rimlight.edge_sampling.geometry.device_edges import beside_edge, rounding
+from rimlight.edge_sampling.geometry.device_edges import rounding
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.parametrisation import material_point
-from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
-from rimlight.edge_sampling.rays import spawn_ray
+from rimlight.edge_sampling.projection.sensors import Projection
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
+from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow, fall, look, on_both_sides, thrown
 from .near_lamps import moved_with, share_at_first, still_on_film
 from .tracer import Tracer
 
@@ -140,6 +140,7 @@ class ShadowBoundary:
             n_dl = mi.Vector2f(-tangent.y, tangent.x) / (edge.sample.density * light.density * (count / len(self)))
             n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light)) * edge.sign
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
+            active &= on_both_sides(tracer, projection, sensor, view, shadow, n_dl, active)
             n_dl = dr.select(active, n_dl, 0)
             view.active = active
             u = dr.select(active, view.u, 0)  # what is not finite would spoil pixels, even with the value 0
@@ -314,137 +315,3 @@ class ShadowBoundary:
                 Le *= 1 - division.turns(r2, ω_x)
             L = dr.select(on_surface, Le * mis, L)
         return met, dr.select(active, f * L * view.weight, 0), active
-
-
-# ---------------------- Stations of a sample ----------------------
-
-
-@dataclass
-class LightPoint:
-    """A point of a light; at infinity, y is the direction towards it.
-
-    n : normal, 0 where the light is no surface. density : of y, by area. choice : what is left of a random number.
-    """
-
-    light: mi.UInt32
-    emitter: mi.EmitterPtr
-    choice: mi.Float
-    time: mi.Float
-    numbers: mi.Point2f
-    on_surface: mi.Bool
-    far: mi.Bool
-    y: mi.Point3f
-    n: mi.Vector3f
-    density: mi.Float
-
-
-@dataclass
-class LitEdge:
-    """A point p of an edge as the light sees it, with the tangent there.
-
-    lit : unit vector across edge and light, towards the lit side. d, ω : from the light to p, ω of unit length.
-    outline : all that is known of the point; None where it is on no edge. slack, sign : see `OutlinePoint`.
-    """
-
-    sample: EdgeSample
-    p: mi.Point3f
-    tangent: mi.Vector3f
-    lit: mi.Vector3f
-    d: mi.Vector3f
-    ω: mi.Vector3f
-    active: mi.Bool
-    outline: OutlinePoint | None = None
-    slack: mi.Float | float = 0.0
-    sign: mi.Float | float = 1.0
-
-
-@dataclass
-class Shadow:
-    """Where the shadow of that point falls.
-
-    x : mi.Point3f, a little off the surface. facing : its normal, on the side of the light. lift : how high above it
-    rays start. shape : of the surface. onwards : a ray past the edge to the light. ray, fallen : the one from there,
-    and what it meets.
-    """
-
-    x: mi.Point3f
-    facing: mi.Vector3f
-    lift: mi.Float
-    shape: mi.ShapePtr
-    onwards: mi.Ray3f
-    ray: mi.Ray3f
-    fallen: mi.PreliminaryIntersection3f
-    active: mi.Bool
-
-
-@dataclass
-class SeenShadow:
-    """The shadow as the sensor sees it: at the position u of the film, in pixels.
-
-    slid : part of the light that is held in its direction; None: nothing.
-    """
-
-    u: mi.Point2f
-    ray: mi.RayDifferential3f
-    weight: mi.Spectrum
-    seen: mi.PreliminaryIntersection3f
-    si: mi.SurfaceInteraction3f
-    aperture_sample: mi.Point2f | None
-    active: mi.Bool
-    slid: mi.Float | None = None
-
-
-def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
-    p, ω, far = edge.p, edge.ω, light.far
-    aside = edge.lit * (beside_edge(p, dr.select(far, p, light.y)) + edge.slack)
-    ray = mi.Ray3f(p + aside, ω)
-    ray.time = light.time
-    fallen = scene.ray_intersect_preliminary(ray, active=edge.active)
-    active = edge.active & fallen.is_valid()
-    # A ray towards the light will start above the surface: from where it starts, it must meet the edge.
-    hit = fallen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-    if edge.outline is not None:
-        on_edge = dr.abs_dot(hit.n, hit.p - p) <= rounding(p, dr.select(far, p, light.y))
-        active &= ~(on_edge & edge.outline.is_behind(hit.n, ω))
-    facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
-    lift = dr.dot(spawn_ray(scene, hit, -ω).o - hit.p, facing)
-    cos_x = -dr.dot(facing, ω)
-    along = (lift + dr.dot(aside, facing)) / dr.maximum(cos_x, 0.05)
-    x = mi.Point3f(hit.p - aside - ω * along - facing * lift)
-    towards_light = dr.select(far, -ω, dr.normalize(light.y - p - aside))
-    onwards = mi.Ray3f(p + aside, towards_light, light.time, ray.wavelengths)
-    return Shadow(x, facing, lift, fallen.shape, onwards, ray, fallen, active)
-
-
-def look(
-    tracer: Tracer, projection: Projection, sensor: mi.Sensor, sampler: mi.Sampler, time: mi.Float, shadow: Shadow
-) -> SeenShadow:
-    """Does the sensor see it?"""
-    x = shadow.x
-    aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else None
-    film_point = projection.film(x, aperture_sample)
-    u = dr.detach(film_point.position())
-    in_depth = (film_point.z > projection.near) & (film_point.z < projection.far)
-    active = shadow.active & inside_frame(u, sensor.film()) & in_depth
-    ray, weight = sensor.sample_ray_differential(
-        time,
-        sampler.next_1d() if mi.is_spectral else 0.0,
-        (u - projection.crop_offset) / projection.crop_size,
-        mi.Point2f(0.5) if aperture_sample is None else aperture_sample,
-        active,
-    )
-    ray = dr.detach(ray)
-    seen = tracer.first_hit(ray, active)
-    active &= seen.is_valid() & (seen.shape == shadow.shape)
-    si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off it, but
-    # less than the ray will start above it.
-    active &= dr.abs_dot(si.n, x - si.p) <= shadow.lift + rounding(x, ray.o)
-    return SeenShadow(u, ray, weight, seen, si, aperture_sample, active)
-
-
-def thrown(v: mi.Vector3f, light: LightPoint, edge: LitEdge, shadow: Shadow) -> mi.Vector3f:
-    """How the shadow moves over what it falls on if the point of the edge moves by v."""
-    facing, d = shadow.facing, edge.d
-    s = dr.select(light.far, 1, dr.dot(facing, shadow.x + facing * shadow.lift - light.y) / dr.dot(facing, d))
-    return s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))

@@ -27,7 +27,7 @@ def behind_veils(
     passed: Callable[[mi.SurfaceInteraction3f, mi.Ray3f], mi.Bool],
     active: mi.Bool,
 ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
-    """Rays as they go on behind veils, and what they meet. pi : what they meet first. passed : which veils. Detached."""
+    """The rays behind veils, and what they meet. pi : what they meet first. passed : which veils. Detached."""
 
     def go_on(ray, pi, active):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)

@@ -1,4 +1,5 @@
-"""T-junctions and cracks: open edges that lie on one another, though they do not have their end points in common.
+"""T-junctions and cracks: open edges that lie on one another, though they do not have their end points in common; and
+the edges of things that stand side by side.
 
 Where a vertex lies inside of an open edge, that edge is divided there, for the purpose of edges alone: the mesh that is
 rendered stays as it is. Pieces that then have the same end points are one edge with a face on each side, at which there
@@ -8,6 +9,7 @@ is no hole. End points that are a little apart count as one: cracks that are nar
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -15,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from . import meshes
+from .device_edges import COPLANAR
 from .edges import SLIVER, EdgeKind, Edges, Weld
 from .meshes import Geometry
 from .texture_lines import jumps_at_every_edge
@@ -28,6 +31,9 @@ ON_EDGE = 1e-5
 
 #: Edges are parallel within this sine.
 PARALLEL = 1e-4
+
+#: Edges of meshes whose boxes meet are looked at if there are at most so many pairs of such meshes.
+MESHES = 10**4
 
 #: At most so many pairs of an edge and an end point near it are looked at: a soup of long triangles has too many.
 PAIRS = 10**7
@@ -74,7 +80,8 @@ class Cracks:
 
 @dataclass(frozen=True)
 class _Open:
-    """Open edges: (n,). ends : (n, 2), vertices. p : (n, 2, 3), where these are. length : (n,). mesh : (n,)."""
+    """Open edges, and edges beside other meshes: (n,). ends : (n, 2), vertices. p : (n, 2, 3), where these are. length,
+    mesh : (n,)."""
 
     edges: Edges
     ends: np.ndarray
@@ -94,7 +101,8 @@ class _Open:
 
 
 def close_cracks(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
-    """Join the open edges that lie on one another. On the host, and cheap: only open edges take part.
+    """Join the edges that lie on one another. On the host, and cheap: only open edges take part, and those of meshes
+    whose boxes meet.
 
     Returns the edges, the joined ones last; and where they were joined, and where faces without area were left out.
     """
@@ -116,7 +124,7 @@ def _left_out(geometry: Geometry, slivers: np.ndarray) -> Cracks:
 
 
 def _join(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
-    where = np.flatnonzero(edges.open)
+    where = np.flatnonzero(edges.open | _beside_others(geometry, edges))
     if len(where) < 2:
         return edges, Cracks.none()
     p = geometry.host_positions()[edges.vertices[where, 0]].astype(np.float64)
@@ -134,6 +142,39 @@ def _join(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
     keep = np.ones(len(edges), bool)
     keep[where[used]] = False
     return edges.take(keep) + new, joined + inside
+
+
+def _beside_others(geometry: Geometry, edges: Edges) -> np.ndarray:
+    """Which edges between two faces of a mesh may lie on edges of another mesh, as those of boxes that stand side by
+    side, flush at the front: (E,), bool. Not those at which nothing jumps, whether seen or as a silhouette."""
+    found = np.zeros(len(edges), bool)
+    bends = (edges.count == 2) & (edges.kind != EdgeKind.SMOOTH) & (edges.mesh[:, 0] == edges.mesh[:, 1])
+    which = np.flatnonzero(bends & ~edges.is_line)
+    positions = geometry.host_positions()
+    mesh, number = edges.mesh[which, 0], len(geometry.meshes)
+    if not len(which) or number < 2:
+        return found
+    first = np.cumsum([0, *(m.vertex_count() for m in geometry.meshes)])
+    low, high = (np.array([f(positions[a:b], 0) for a, b in pairwise(first)]) for f in (np.min, np.max))
+    slack = ON_EDGE * (high - low).max(1, keepdims=True)
+    low, high = low - slack, high + slack
+    meet = (low[:, None] <= high[None]).all(2)
+    pairs = np.argwhere(meet & meet.T & ~np.eye(number, dtype=bool))
+    if len(pairs) > MESHES:
+        return found
+    p = positions[edges.vertices[which, 0]]
+    ends = p.min(1), p.max(1)
+    for i, j in pairs:
+        found[which] |= (mesh == i) & (ends[0] <= high[j]).all(1) & (ends[1] >= low[j]).all(1)
+    return found & ~_is_coplanar(edges, positions)
+
+
+def _is_coplanar(edges: Edges, p: np.ndarray) -> np.ndarray:
+    """Do both faces of edges lie in one plane? (E,), bool."""
+    a, b = (p[edges.vertices[:, 0, k]].astype(np.float64) for k in (0, 1))
+    n = [np.cross(b - a, p[edges.opposite[:, side]] - a) for side in (0, 1)]
+    sine = np.linalg.norm(np.cross(*n), axis=1)
+    return sine <= COPLANAR * np.linalg.norm(n[0], axis=1) * np.linalg.norm(n[1], axis=1)
 
 
 def _join_ends(lone: _Open, weld: Weld) -> tuple[np.ndarray, Cracks]:
@@ -217,24 +258,29 @@ def _pair(
     used = np.unique(edge[shared])
     here = np.isin(edge, used)
     edge, piece, ends, key = edge[here], piece[here], ends[here], key[here]
-    order = np.argsort(key, kind="stable")
+    # Those with two faces first, which stand for all with the same end points.
+    order = np.lexsort((-lone.edges.count[edge].astype(np.int64), key))
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     count = np.diff(np.append(first, len(order)))
     a, b = order[first], order[first + np.minimum(count - 1, 1)]
-    turn = ends[a, 0] != ends[b, 0]
+    of = lone.edges
+    closed, turn = of.count[edge[a]] == 2, ends[a, 0] != ends[b, 0]
     vertices, part = np.stack([lone.ends[edge[a]], lone.ends[edge[b]]], 1), np.stack([piece[a], piece[b]], 1)
     vertices[turn, 1] = vertices[turn, 1, ::-1]
     part[turn, 1] = 1 - part[turn, 1, ::-1]
+    vertices[closed, 1], part[closed, 1] = of.vertices[edge[a][closed], 1], part[closed, 0]
+    opposite = np.stack([of.opposite[edge[a], 0], of.opposite[edge[b], 0]], 1)
+    opposite[closed, 1] = of.opposite[edge[a][closed], 1]
     mesh = np.stack([lone.mesh[edge[a]], lone.mesh[edge[b]]], 1)
     even = np.array([_is_even(m) for m in geometry.meshes])[mesh[:, 0]]
     # As where sides are whole: of faces that run through it in the same direction, one shows its back.
-    flat = even & (count == 2) & turn & (mesh[:, 0] == mesh[:, 1])
+    flat = even & ~closed & (count == 2) & turn & (mesh[:, 0] == mesh[:, 1])
     new = Edges(
         vertices=vertices.astype(np.uint32),
-        opposite=np.stack([lone.edges.opposite[edge[a], 0], lone.edges.opposite[edge[b], 0]], 1),
+        opposite=opposite,
         mesh=mesh.astype(np.uint32),
-        kind=np.where(flat, EdgeKind.FLAT, EdgeKind.JUMP).astype(np.uint8),
-        count=count.astype(np.uint32),
+        kind=np.select([count == 1, flat], [of.kind[edge[a]], EdgeKind.FLAT], EdgeKind.JUMP).astype(np.uint8),
+        count=np.add.reduceat(of.count[edge[order]], first).astype(np.uint32),
         is_line=np.zeros(len(a), bool),
         part=part.astype(np.float32),
         joined=np.ones(len(a), bool),

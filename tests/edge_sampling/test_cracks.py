@@ -7,6 +7,7 @@ import cuts
 import mitsuba as mi
 import numpy as np
 import pytest
+import tidy
 
 from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling import EdgeKind, Geometry, close_cracks, find_welded_edges
@@ -51,6 +52,23 @@ def test_the_part_of_a_long_edge_on_which_nothing_lies_stays_open():
     assert sorted(new.count) == [1, 1, 2] and len(cracks) == 2 and (new.kind == EdgeKind.JUMP).all()
     parts = {tuple(p) for p in new.part[:, 0].tolist()}
     assert parts == {(0.0, 0.5), (0.5, 1.0)}
+
+
+def test_where_things_stand_side_by_side_their_edges_are_one():
+    """Of two boxes that are flush at the front and the back, one twice as high: an edge has four faces as far as both
+    have it, and the rest of the higher one is as before."""
+    low, high = tidy.block("low", (-1, 0, 0), (0, 0.5, 1), 0.5), tidy.block("high", (0, 0, 0), (1, 1, 1), 0.5)
+    edges, cracks, before = joined(low, high)
+    folds = lambda e: e.take(e.kind != EdgeKind.SMOOTH)
+    assert not before.open.any() and len(cracks) == 2
+    new = edges.take(edges.joined)
+    assert sorted(new.count) == [2, 2, 4, 4] and len(edges) == len(before)
+    assert (new.kind[new.count == 4] == EdgeKind.JUMP).all() and (new.kind[new.count == 2] == EdgeKind.FLAT).all()
+    ends = Geometry((low, high)).host_positions()[new.vertices.astype(int)]
+    a, b = ends[:, :, 0], ends[:, :, 1]
+    heights = (a + new.part[..., :1] * (b - a))[..., 1], (a + new.part[..., 1:] * (b - a))[..., 1]
+    np.testing.assert_allclose(np.sort(np.minimum(*heights)[:, 0]), [0, 0, 0.5, 0.5], atol=1e-6)
+    assert len(folds(edges)) == len(folds(before))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,68 @@
+"""Scenes as people build them: edges on edges, on lines of textures and in one plane with the light. Each of them was
+found twice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mitsuba as mi
+from building import camera, constant, diffuse, mesh, quad, scene
+from random_rooms import box
+
+
+def block(name: str, low: tuple, high: tuple, *colour: float) -> mi.Mesh:
+    points, _, _, faces = box(low, high)
+    return mesh(name, points, faces, bsdf=diffuse(*colour))
+
+
+def floor(bsdf: dict | None = None) -> mi.Mesh:
+    corners, bsdf = [[-2, 0, -2], [2, 0, -2], [-2, 0, 2], [2, 0, 2]], bsdf or diffuse(0.5)
+    uv = [[0, 0], [1, 0], [0, 1], [1, 1]]
+    return mesh("floor", corners, [[0, 2, 1], [1, 2, 3]], uv=uv, bsdf={"type": "twosided", "inner": bsdf})
+
+
+def sun(*direction: float) -> dict:
+    return {"type": "directional", "direction": list(direction), "irradiance": {"type": "rgb", "value": 3.0}}
+
+
+def seen(**objects: dict | mi.Object) -> mi.Scene:
+    return scene(sensor=camera((0.9, 2.2, -3.4), (0.037, 0.213, 0.01), fov=40), **objects)
+
+
+def box_on_lines() -> mi.Scene:
+    """A box on a checkered floor, whose edges lie on the lines."""
+    place = mi.ScalarTransform3f().scale([4, 4])
+    board = {"type": "checkerboard", "color0": 0.1, "color1": 0.8, "to_uv": place}
+    on = floor({"type": "diffuse", "reflectance": board})
+    return seen(floor=on, box=block("box", (-0.5, 0, -0.5), (0.5, 1, 0.5), 0.6), sky=constant(0.3))
+
+
+def stair() -> mi.Scene:
+    """Two boxes side by side, flush at the front, one of them higher; a sun shines along their sides."""
+    one = block("one", (-0.5, 0, -0.5), (0, 0.5, 0.5), 0.7, 0.2, 0.2)
+    two = block("two", (0, 0, -0.5), (0.5, 1, 0.5), 0.2, 0.2, 0.7)
+    return seen(floor=floor(), one=one, two=two, sun=sun(0, -1, 1), sky=constant(0.1))
+
+
+def shelf() -> mi.Scene:
+    """A sheet that goes on from the upper edge of a box."""
+    sheet = quad((0, 0.5, -0.5), (0, 0, 1), (1, 0, 0), "sheet", bsdf=diffuse(0.7, two_sided=True))
+    one = block("one", (-0.5, 0, -0.5), (0, 0.5, 0.5), 0.7, 0.2, 0.2)
+    return seen(floor=floor(), one=one, sheet=sheet, sun=sun(0, -1, 1), sky=constant(0.1))
+
+
+def can_on_box() -> mi.Scene:
+    """An open cylinder on a box that is as wide, in a sun that shines along the sides of both."""
+    can = {"type": "cylinder", "p0": [0, 0.5, 0], "p1": [0, 1, 0], "radius": 0.4, "bsdf": diffuse(0.6, two_sided=True)}
+    return seen(floor=floor(), box=block("box", (-0.4, 0, -0.4), (0.4, 0.5, 0.4), 0.5), can=can, sun=sun(0, -1, 1))
+
+
+CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.2]}
+
+#: Scene, motion, step.
+TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
+    "box_on_lines": (box_on_lines, CAMERA, 2e-3),
+    "stair": (stair, CAMERA, 2e-3),
+    "shelf": (shelf, CAMERA, 2e-3),
+    "can_on_box": (can_on_box, CAMERA, 2e-3),
+}
