@@ -28,7 +28,9 @@ MORE_CASES = (
     "checkerboard_close aligned_ball mirrored_lamp beam_turns picture_turns cornell_box hidden_shadow "
     "hidden_picture box_behind_glass spike patchwork_camera stretched_ball lampshade_wall sunk_sphere_slides "
     "pillar_turns strip_wall cut_bulb polished_camera polished_floor polished_rises fine_camera fine_look fine_wall "
-    "rippled_mirror checkers_throw checkers_beside lamp_slides coarse_normals coarse_slides coarse_hill"
+    "rippled_mirror checkers_throw checkers_beside lamp_slides coarse_normals coarse_slides coarse_hill "
+    "wall_in_water window_in_floor glass_in_floor coarse_veil coarse_behind_pane checkered_facets pictured_globe "
+    "box_on_lines stair shelf can_on_box"
 )
 
 #: Slow tests, by how their names begin.
