@@ -187,6 +187,7 @@ def on_both_sides(
     lens = mi.Point2f(0.5) if view.aperture_sample is None else view.aperture_sample
     on_film = (u - projection.crop_offset) / projection.crop_size
     ray, _ = sensor.sample_ray_differential(view.ray.time, 0.5, on_film, lens, active)
-    si = tracer.first_hit(ray, active).compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-    goes_on = (si.shape == shadow.shape) & (dr.abs_dot(si.n, shadow.facing) > LEAST_COSINE)
+    pi = tracer.first_hit(ray, active)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+    goes_on = (pi.shape == shadow.shape) & (dr.abs_dot(si.n, shadow.facing) > LEAST_COSINE)
     return goes_on & (dr.abs_dot(shadow.facing, si.p - shadow.x) <= shadow.lift + (1 + BESIDE) * slack)

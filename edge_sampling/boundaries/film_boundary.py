@@ -222,9 +222,10 @@ class FilmBoundary:
             beside, rest, n, n_dl, active = on_grids(outlines, at, look, chosen, found, u, p, n_dl, around, active)
             rays, weights = _beside(at, sensor, sampler, beside, (aside + rest * reach) * n, active)
             met = [tracer.first_hit(ray, active) for ray in rays]
-            before = self._before(at, p, rays[0].o, around)
-            sides = rays, met
-            if before is not None:
+            before, sides = None, (rays, met)
+            if self.veils:
+                slack = BENT * around / at.projection.pixels_per_unit(at.projection.film(p))
+                before = Before(p, rounding(p, rays[0].o) + slack, mi.Bool(True))
                 go_on = lambda ray, pi: behind_veils(scene, ray, pi, before.veils, active)
                 sides = zip(*map(go_on, rays, met), strict=True)
             sides = [list(of) for of in sides]
@@ -254,13 +255,6 @@ class FilmBoundary:
             ray, pi = behind_veils(scene, ray, pi, no_grid, active)
         return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
 
-    def _before(self, at: Placed, p: mi.Point3f, o: mi.Point3f, around: mi.Float) -> Before | None:
-        """See `BoundaryPoints`. around : how far beside the points p rays from o look, pixels."""
-        if not self.veils:
-            return None
-        per_unit = at.projection.pixels_per_unit(at.projection.film(p))
-        return Before(p, rounding(p, o) + BENT * around / per_unit, mi.Bool(True))
-
     def _shared_directions(
         self, chosen: Chosen, lune: Lune | None, rays, met, horizons, active: mi.Bool
     ) -> Directions | None:
@@ -289,7 +283,10 @@ class FilmBoundary:
             # A line of a texture may lie along an edge, beyond which is another plane.
             bent = BENT * outlines.beside_texture(at, chosen)
             hidden = outlines.edges.is_hidden(at.positions, chosen.edge, p, eye, view, rays, surfaces, bent)
-            hidden |= (bent > 0) & ~_go_on(*surfaces)
+            # But what both rays meet must be one surface, and not something that stands on it.
+            s, t = surfaces
+            one = (s.shape == t.shape) & (s.instance == t.instance) & (dr.dot(s.n, t.n) > LEAST_COSINE)
+            hidden |= (bent > 0) & ~one
             grids = outlines.edges.grids
             if grids.any:
                 of = at.positions, at.normals, chosen.edge, found.t, p
@@ -387,12 +384,6 @@ class FilmBoundary:
         per_unit = projection.pixels_per_unit(projection.film(p))
         on_film = ulps * max(projection.crop_size + projection.crop_offset)
         return (ulps * largest + farther) * per_unit + on_film, reach * per_unit
-
-
-def _go_on(first: mi.SurfaceInteraction3f, second: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Are two points close by on one surface, and not one of them on something that stands on it?"""
-    one = (first.shape == second.shape) & (first.instance == second.instance)
-    return one & (dr.dot(first.n, second.n) > LEAST_COSINE)
 
 
 def _beside(at: Placed, sensor: mi.Sensor, sampler: mi.Sampler, u, offset, active) -> tuple[list, list]:
