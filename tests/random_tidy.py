@@ -49,6 +49,8 @@ class TidyGenerator(PatternGenerator):
         kind, bsdf = self.bsdf(uv=True)
         #: Must things stand still, since they hide what lies on one side of a line? Do two touch along the first axis?
         self.still, self.in_row = kind.startswith("patterned"), False
+        #: Does a light shine along faces?
+        self.along = False
         if self.chance(0.3):
             kind, lines = "aligned", mi.ScalarTransform3f().scale([self.pick(6, 12, 24), self.pick(6, 12, 24)])
             board = {"type": "checkerboard", "color0": 0.1, "color1": self.colour(), "to_uv": lines}
@@ -138,7 +140,7 @@ class TidyGenerator(PatternGenerator):
         way, turn = self.direction() * [1, 0, 1], self.uniform(-20, 20)
         if how != "slides" or self.in_row:
             way, turn = np.array([1.0, 0, 0] if how == "along" else [0, 0, 1.0]), 0.0
-        if hasattr(self, "along") or "wall" in self.objects:
+        if self.along or "wall" in self.objects:
             turn = 0.0
         about, way = (mi.Vector3f(*map(float, v)) for v in (self.place(centre), way * self.scale))
 

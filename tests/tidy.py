@@ -57,6 +57,13 @@ def can_on_box() -> mi.Scene:
     return seen(floor=floor(), box=block("box", (-0.4, 0, -0.4), (0.4, 0.5, 0.4), 0.5), can=can, sun=sun(0, -1, 1))
 
 
+def carpet() -> mi.Scene:
+    """A box on a carpet as thin as paper, whose border throws its shadow closely beside it."""
+    place = mi.ScalarTransform4f().translate([0, 5e-4, 0]).rotate([1, 0, 0], -90).scale(0.8)
+    on = {"type": "rectangle", "to_world": place, "bsdf": diffuse(0.8, two_sided=True)}
+    return seen(floor=floor(), carpet=on, box=block("box", (-0.5, 5e-4, -0.5), (0.5, 0.6, 0.5), 0.3), sun=sun(0, -1, 1))
+
+
 CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.2]}
 
 #: Scene, motion, step.
@@ -65,4 +72,5 @@ TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
     "stair": (stair, CAMERA, 2e-3),
     "shelf": (shelf, CAMERA, 2e-3),
     "can_on_box": (can_on_box, CAMERA, 2e-3),
+    "carpet": (carpet, CAMERA, 2e-3),
 }

@@ -11,16 +11,15 @@ import mitsuba as mi
 from rimlight.edge_sampling.choice.sampling import EdgeSample
 from rimlight.edge_sampling.choice.silhouettes import OutlinePoint
 from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, beside_edge, rounding
+from rimlight.edge_sampling.geometry.surfaces import GOES_ON
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 from rimlight.edge_sampling.rays import rough_size, spawn_ray
 
 from .tracer import Tracer
 
-#: How far beside a shadow to look for what is in it, in units of what rounding may be.
-BESIDE = 4
-
-#: A surface goes on if there is at most 60° between the normals on both sides.
-LEAST_COSINE = 0.5
+#: How far beside a shadow to look for what is in it, in units of what rounding may be: about as far as rays look beside
+#: edges on the film, so that what lies between an edge and the shadow that it throws close by counts for both.
+BESIDE = 1 / 4
 
 
 @dataclass
@@ -189,5 +188,5 @@ def on_both_sides(
     ray, _ = sensor.sample_ray_differential(view.ray.time, 0.5, on_film, lens, active)
     pi = tracer.first_hit(ray, active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-    goes_on = (pi.shape == shadow.shape) & (dr.abs_dot(si.n, shadow.facing) > LEAST_COSINE)
+    goes_on = (pi.shape == shadow.shape) & (dr.abs_dot(si.n, shadow.facing) > GOES_ON)
     return goes_on & (dr.abs_dot(shadow.facing, si.p - shadow.x) <= shadow.lift + (1 + BESIDE) * slack)

@@ -26,6 +26,7 @@ from rimlight.edge_sampling.first_points import FirstPoints
 from rimlight.edge_sampling.geometry.device_edges import line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
+from rimlight.edge_sampling.geometry.surfaces import GOES_ON
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 
@@ -40,9 +41,6 @@ from .veils import Before, behind_veils
 #: A line of a texture is seen, and what an outline belongs to is met, if what both rays meet is at most so many times
 #: as far from its plane as they are beside it.
 BENT = 4
-
-#: And if there is at most 60° between the normals of both.
-LEAST_COSINE = 0.5
 
 #: What perfect mirrors do, and all that lets light through.
 STRAIGHT = int(mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission)
@@ -285,7 +283,7 @@ class FilmBoundary:
             hidden = outlines.edges.is_hidden(at.positions, chosen.edge, p, eye, view, rays, surfaces, bent)
             # But what both rays meet must be one surface, and not something that stands on it.
             s, t = surfaces
-            one = (s.shape == t.shape) & (s.instance == t.instance) & (dr.dot(s.n, t.n) > LEAST_COSINE)
+            one = (s.shape == t.shape) & (s.instance == t.instance) & (dr.dot(s.n, t.n) > GOES_ON)
             hidden |= (bent > 0) & ~one
             grids = outlines.edges.grids
             if grids.any:

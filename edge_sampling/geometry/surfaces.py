@@ -11,6 +11,10 @@ from .meshes import has_interpolated_normals, has_texcoords, is_flipped, objects
 #: How far on both sides of a point of a grid its normals are compared: in voxels.
 NEXT = 0.01
 
+#: Cosine between the normals of what two rays close by meet, from which on that is one surface, and not something that
+#: stands on it.
+GOES_ON = 0.5
+
 
 class Surfaces:
     """The surfaces of a scene.
