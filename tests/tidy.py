@@ -6,8 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import mitsuba as mi
+import numpy as np
 from building import camera, constant, diffuse, mesh, quad, scene
-from random_rooms import box
+from random_rooms import box, joined
 
 
 def block(name: str, low: tuple, high: tuple, *colour: float) -> mi.Mesh:
@@ -64,7 +65,53 @@ def carpet() -> mi.Scene:
     return seen(floor=floor(), carpet=on, box=block("box", (-0.5, 5e-4, -0.5), (0.5, 0.6, 0.5), 0.3), sun=sun(0, -1, 1))
 
 
+def tiled_floor(n: int) -> mi.Mesh:
+    """A floor of n × n squares."""
+    at = np.linspace(-2, 2, n + 1)
+    corners = [[x, 0, z] for z in at for x in at]
+    first = [j * (n + 1) + i for j in range(n) for i in range(n)]
+    faces = [f for a in first for f in ([a, a + n + 1, a + 1], [a + 1, a + n + 1, a + n + 2])]
+    return mesh("floor", corners, faces, bsdf=diffuse(0.5, two_sided=True))
+
+
+def lamp() -> dict:
+    return {"type": "point", "position": [1.2, 2.5, -1.4], "intensity": {"type": "rgb", "value": 8.0}}
+
+
+def box_in_lines() -> mi.Scene:
+    """A box that stands in a floor, exactly along the edges between its squares."""
+    return seen(floor=tiled_floor(8), box=block("box", (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), 0.6), sun=sun(0, -1, 0))
+
+
+def box_on_corners() -> mi.Scene:
+    """A box that stands on a floor, with its corners on those of squares."""
+    return seen(floor=tiled_floor(4), box=block("box", (-1, 0, -1), (0, 1, 0), 0.6), lamp=lamp())
+
+
+def steps() -> mi.Scene:
+    """Three boxes side by side, flush at the front, each higher than the last, in one mesh."""
+    boxes = [box((x, 0, -0.5), (x + 0.4, y, 0.5)) for x, y in ((-0.6, 0.3), (-0.2, 0.6), (0.2, 0.9))]
+    points, _, _, faces = joined(*boxes)
+    return seen(floor=floor(), steps=mesh("steps", points, faces, bsdf=diffuse(0.5)), lamp=lamp())
+
+
+def books() -> mi.Scene:
+    """Books on a board and a board on the last of them, flush at their ends."""
+    sizes = {
+        "below": ((-1, 0, 0.5), (1, 0.1, 1)),
+        "first": ((-1, 0.1, 0.5), (-0.9, 0.6, 1)),
+        "second": ((-0.9, 0.1, 0.55), (-0.8, 0.5, 1)),
+        "third": ((-0.8, 0.1, 0.5), (-0.6, 0.55, 1)),
+        "last": ((0.9, 0.1, 0.5), (1, 0.6, 1)),
+        "above": ((-1, 0.6, 0.5), (1, 0.7, 1)),
+    }
+    colours = dict(zip(sizes, (0.6, 0.6, 0.3, 0.7, 0.6, 0.6), strict=True))
+    return seen(floor=floor(), sun=sun(0, -1, 0), **{k: block(k, *size, colours[k]) for k, size in sizes.items()})
+
+
 CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.2]}
+
+BOX = {"key": "box.vertex_positions", "direction": [1, 0, 0.4]}
 
 #: Scene, motion, step.
 TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
@@ -73,4 +120,8 @@ TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
     "shelf": (shelf, CAMERA, 2e-3),
     "can_on_box": (can_on_box, CAMERA, 2e-3),
     "carpet": (carpet, CAMERA, 2e-3),
+    "box_in_lines": (box_in_lines, BOX, 2e-3),
+    "box_on_corners": (box_on_corners, BOX, 2e-3),
+    "steps": (steps, CAMERA, 2e-3),
+    "books": (books, CAMERA, 2e-3),
 }

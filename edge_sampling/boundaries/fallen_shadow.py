@@ -21,6 +21,9 @@ from .tracer import Tracer
 #: edges on the film, so that what lies between an edge and the shadow that it throws close by counts for both.
 BESIDE = 1 / 4
 
+#: A shadow that falls as close to its edge as this, in the same units, falls on the surface on which the edge lies.
+FLUSH = 32
+
 
 @dataclass
 class LightPoint:
@@ -107,8 +110,11 @@ def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
     # A ray towards the light will start above the surface: from where it starts, it must meet the edge.
     hit = fallen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
     if edge.outline is not None:
-        on_edge = dr.abs_dot(hit.n, hit.p - p) <= rounding(p, dr.select(far, p, light.y))
-        active &= ~(on_edge & edge.outline.is_behind(hit.n, ω))
+        slack = rounding(p, dr.select(far, p, light.y))
+        on_edge = dr.abs_dot(hit.n, hit.p - p) <= slack
+        # What lies in that surface at the point itself throws no shadow on it: sides of boxes that stand flush.
+        flush = dr.norm(hit.p - p) <= FLUSH * slack
+        active &= ~(on_edge & edge.outline.is_behind(hit.n, ω, flush))
     facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
     lift = dr.dot(spawn_ray(scene, hit, -ω).o - hit.p, facing)
     cos_x = -dr.dot(facing, ω)
@@ -156,8 +162,9 @@ def look(
     )
     ray = dr.detach(ray)
     seen = tracer.first_hit(ray, active)
-    active &= seen.is_valid() & (seen.shape == shadow.shape)
     si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    # Of two shapes in one place, rays may meet either.
+    active &= seen.is_valid() & ((seen.shape == shadow.shape) | (dr.abs_dot(si.n, shadow.facing) > GOES_ON))
     # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off it, but
     # less than the ray will start above it.
     active &= dr.abs_dot(si.n, x - si.p) <= shadow.lift + rounding(x, ray.o)

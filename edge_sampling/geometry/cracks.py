@@ -9,7 +9,6 @@ is no hole. End points that are a little apart count as one: cracks that are nar
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -32,8 +31,8 @@ ON_EDGE = 1e-5
 #: Edges are parallel within this sine.
 PARALLEL = 1e-4
 
-#: Edges of meshes whose boxes meet are looked at if there are at most so many pairs of such meshes.
-MESHES = 10**4
+#: Edges of connected surfaces whose boxes meet are looked at if there are at most so many pairs of such surfaces.
+SURFACES = 10**4
 
 #: At most so many pairs of an edge and an end point near it are looked at: a soup of long triangles has too many.
 PAIRS = 10**7
@@ -80,7 +79,7 @@ class Cracks:
 
 @dataclass(frozen=True)
 class _Open:
-    """Open edges, and edges beside other meshes: (n,). ends : (n, 2), vertices. p : (n, 2, 3), where these are. length,
+    """Open edges, and those beside other surfaces: (n,). ends : (n, 2), vertices. p : (n, 2, 3), their places. length,
     mesh : (n,)."""
 
     edges: Edges
@@ -101,7 +100,7 @@ class _Open:
 
 
 def close_cracks(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
-    """Join the edges that lie on one another. On the host, and cheap: only open edges take part, and those of meshes
+    """Join the edges that lie on one another. On the host, and cheap: only open edges take part, and those of surfaces
     whose boxes meet.
 
     Returns the edges, the joined ones last; and where they were joined, and where faces without area were left out.
@@ -124,7 +123,7 @@ def _left_out(geometry: Geometry, slivers: np.ndarray) -> Cracks:
 
 
 def _join(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
-    where = np.flatnonzero(edges.open | _beside_others(geometry, edges))
+    where = np.flatnonzero(edges.open | _beside_others(geometry, edges, weld.surface))
     if len(where) < 2:
         return edges, Cracks.none()
     p = geometry.host_positions()[edges.vertices[where, 0]].astype(np.float64)
@@ -144,29 +143,45 @@ def _join(geometry: Geometry, edges: Edges, weld: Weld) -> tuple[Edges, Cracks]:
     return edges.take(keep) + new, joined + inside
 
 
-def _beside_others(geometry: Geometry, edges: Edges) -> np.ndarray:
-    """Which edges between two faces of a mesh may lie on edges of another mesh, as those of boxes that stand side by
-    side, flush at the front: (E,), bool. Not those at which nothing jumps, whether seen or as a silhouette."""
+def _beside_others(geometry: Geometry, edges: Edges, surface: np.ndarray) -> np.ndarray:
+    """Which edges between two faces of a mesh may lie on edges of another surface, as those of boxes that stand side by
+    side, flush at the front: (E,), bool. Not those at which nothing jumps, whether seen or as a silhouette.
+
+    surface : see `Weld`.
+    """
     found = np.zeros(len(edges), bool)
-    bends = (edges.count == 2) & (edges.kind != EdgeKind.SMOOTH) & (edges.mesh[:, 0] == edges.mesh[:, 1])
-    which = np.flatnonzero(bends & ~edges.is_line)
-    positions = geometry.host_positions()
-    mesh, number = edges.mesh[which, 0], len(geometry.meshes)
-    if not len(which) or number < 2:
+    if not len(edges):
         return found
-    first = np.cumsum([0, *(m.vertex_count() for m in geometry.meshes)])
-    low, high = (np.array([f(positions[a:b], 0) for a, b in pairwise(first)]) for f in (np.min, np.max))
+    positions = geometry.host_positions()
+    ends = positions[edges.vertices[:, 0]]
+    ends = ends.min(1), ends.max(1)
+    order = np.argsort(surface, kind="stable")
+    first = np.flatnonzero(np.diff(surface[order], prepend=-1))
+    low, high = np.minimum.reduceat(ends[0][order], first), np.maximum.reduceat(ends[1][order], first)
     slack = ON_EDGE * (high - low).max(1, keepdims=True)
     low, high = low - slack, high + slack
-    meet = (low[:, None] <= high[None]).all(2)
-    pairs = np.argwhere(meet & meet.T & ~np.eye(number, dtype=bool))
-    if len(pairs) > MESHES:
-        return found
-    p = positions[edges.vertices[which, 0]]
-    ends = p.min(1), p.max(1)
-    for i, j in pairs:
-        found[which] |= (mesh == i) & (ends[0] <= high[j]).all(1) & (ends[1] >= low[j]).all(1)
-    return found & ~_is_coplanar(edges, positions)
+    bends = (edges.count == 2) & (edges.kind != EdgeKind.SMOOTH) & (edges.mesh[:, 0] == edges.mesh[:, 1])
+    bends &= ~_is_coplanar(edges, positions)
+    own = np.split(order, first[1:])
+    for i, j in _meet(low, high):
+        which = own[i][bends[own[i]]]
+        found[which] |= (ends[0][which] <= high[j]).all(1) & (ends[1][which] >= low[j]).all(1)
+    return found
+
+
+def _meet(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Pairs of boxes that meet, in both orders: (P, 2). None, if there are more than `SURFACES`."""
+    order = np.argsort(low[:, 0], kind="stable")
+    low, high, n = low[order], high[order], len(order)
+    # Along the first axis, each box meets those that begin before it ends.
+    count = np.maximum(np.searchsorted(low[:, 0], high[:, 0], side="right") - np.arange(n) - 1, 0)
+    if count.sum() > PAIRS:
+        return np.zeros((0, 2), np.int64)
+    i = np.repeat(np.arange(n), count)
+    j = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + i + 1
+    meet = (low[i] <= high[j]).all(1) & (low[j] <= high[i]).all(1)
+    pairs = order[np.stack([i[meet], j[meet]], 1)]
+    return np.concatenate([pairs, pairs[:, ::-1]]) if 2 * len(pairs) <= SURFACES else np.zeros((0, 2), np.int64)
 
 
 def _is_coplanar(edges: Edges, p: np.ndarray) -> np.ndarray:

@@ -158,7 +158,8 @@ class DeviceEdges:
         edge does, as in views along an axis of symmetry, or so close to it that it passes between the rays. Of an edge
         that is no silhouette, both faces must be seen, which excludes those at so grazing an angle that a ray has left
         its face, and met what lies beyond the face's other edges. A silhouette must be seen if a ray passes through
-        both of its faces, as it does unless one is narrower than the rays are apart.
+        both of its faces, as it does unless one is narrower than the rays are apart. Where more faces meet, a ray must
+        meet a surface in whose plane the edge is.
 
         p : a point of the edge that the rays pass, world space. eye, view : see `is_boundary`.
         met : what the rays meet. What lets rays through hides nothing. farther : how much farther they may be from the
@@ -166,7 +167,7 @@ class DeviceEdges:
         """
         a, b = self.end_points(positions, edge)
         normals = [dr.normalize(dr.cross(b - a, o - a)) for o in self.opposite(positions, edge)]
-        covers, shown, crack = [], [], self._crack(positions, edge)
+        covers, shown, reached, crack = [], [], mi.Bool(False), self._crack(positions, edge)
         for ray, si in zip(rays, met, strict=True):
             through = self._lets_through(si)
             slack = rounding(p, ray.o) + crack + farther
@@ -174,13 +175,16 @@ class DeviceEdges:
             there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
             covers.append(passed[0] & passed[1])
             shown.append((passed[0] & there[0]) | (passed[1] & there[1]))
-        fold = dr.gather(mi.Bool, self._two_faces, edge) & ~self.is_silhouette(positions, edge, eye, view)
-        line = dr.gather(mi.Bool, self._is_line, edge)
-        covered = dr.gather(mi.Bool, self._few_faces, edge) & (covers[0] | covers[1])
-        hidden = dr.select(fold, ~(shown[0] & shown[1]), covered & ~(shown[0] | shown[1]))
-        return (
-            dr.select(line, self._is_hidden_line(positions, edge, p, rays, met), hidden) if self._any_lines else hidden
-        )
+            beside = dr.norm(dr.cross(p - ray.o, ray.d))
+            reached |= through | (si.is_valid() & (dr.abs_dot(si.n, si.p - p) <= slack + beside))
+        of = lambda kind: dr.gather(mi.Bool, kind, edge)
+        fold = of(self._two_faces) & ~self.is_silhouette(positions, edge, eye, view)
+        covered = (covers[0] | covers[1]) & ~(shown[0] | shown[1])
+        hidden = dr.select(fold, ~(shown[0] & shown[1]), covered)
+        hidden = dr.select(of(self._few_faces), hidden, ~reached)
+        if self._any_lines:
+            hidden = dr.select(of(self._is_line), self._is_hidden_line(positions, edge, p, rays, met), hidden)
+        return hidden
 
     # ---------------------- Of grids ----------------------
 

@@ -14,6 +14,7 @@ from rimlight.edge_sampling.refusals import InputError
 
 from . import meshes
 from .grids import is_grid
+from .half_edges import HalfEdges, mix
 from .meshes import Geometry
 from .texture_lines import jumps_at_every_edge
 
@@ -109,11 +110,14 @@ class Weld:
     tolerance : how far apart vertices at one place may be, scene units.
     slivers : (S, 3), int64; the corners of the faces without area that were left out, the first of them between the
         others.
+    surface : (E,), int64; number of the connected surface to which the first face of each edge belongs. Faces are
+        connected at edges that have two.
     """
 
     place: np.ndarray
     tolerance: float
     slivers: np.ndarray
+    surface: np.ndarray
 
     @property
     def first(self) -> np.ndarray:
@@ -149,7 +153,8 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
         values.append(meshes.vertex_values(mesh))
         offset += len(v)
     if not points:
-        return _no_edges(), Weld(np.zeros(0, np.int64), 0.0, np.zeros((0, 3), np.int64))
+        none = np.zeros(0, np.int64)
+        return _no_edges(), Weld(none, 0.0, np.zeros((0, 3), np.int64), none)
     face, mesh_of_face = np.concatenate(face_list), np.concatenate(mesh_of_face)
     point = np.concatenate(points)
     width = max(t.shape[1] for t in values)
@@ -162,6 +167,8 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
     if rewelded is not weld:
         weld, sides = rewelded, _pair_sides(rewelded, face)
     face, sides, slivers = _without_open_slivers(point, weld, face, sides)
+    if (sides[-1] > 2).any():
+        sides = _pair_sides(weld, face, point)
 
     face0, corner0, face1, corner1, count = sides
     i0, j0, o0 = _corners(face, face0, corner0)
@@ -192,7 +199,9 @@ def find_welded_edges(geometry: Geometry) -> tuple[Edges, Weld]:
         part=np.broadcast_to(WHOLE, (len(face0), 2, 2)),
         joined=np.zeros(len(face0), bool),
     )
-    return edges, Weld(weld, tolerance, slivers)
+    joined = coo_array((np.ones(len(face0), bool), (face0, np.where(count == 2, face1, face0))), shape=(len(face),) * 2)
+    surface = connected_components(joined, directed=False)[1][face0].astype(np.int64)
+    return edges, Weld(weld, tolerance, slivers, surface)
 
 
 def _inside_of_voxels(geometry: Geometry, ends: np.ndarray, mesh: np.ndarray) -> np.ndarray:
@@ -223,17 +232,10 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns of each number the first row that has it, (D,), and of each row its number, (N,), int64.
     """
     # To sort one integer a row is several times faster than to sort rows: mix them, and check for collisions.
-    _, first, number = np.unique(_mix(rows), return_index=True, return_inverse=True)
+    _, first, number = np.unique(mix(rows), return_index=True, return_inverse=True)
     if not (rows[first[number]] == rows).all():
         _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first, number.reshape(-1).astype(np.int64)
-
-
-def _mix(rows: np.ndarray) -> np.ndarray:
-    """Hash the two or three columns of `rows` into one: uint64."""
-    odd = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
-    columns = rows.astype(np.uint64).T
-    return np.bitwise_xor.reduce([c * np.uint64(o) for c, o in zip(columns, odd, strict=False)])
 
 
 def _weld_close(
@@ -257,36 +259,36 @@ def _weld_close(
     return group[weld].astype(np.int64), float(tolerance)
 
 
-def _pair_sides(weld: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, ...]:
+def _pair_sides(weld: np.ndarray, face: np.ndarray, point: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
     """For every welded edge: face and corner of its first and second side, and the number of its faces.
 
     Corner k of a face stands for the side from its vertex k to vertex k + 1.
-    """
-    w = weld[face]
-    alive = np.flatnonzero((w[:, 0] != w[:, 1]) & (w[:, 1] != w[:, 2]) & (w[:, 2] != w[:, 0]))
-    n = int(weld.max()) + 1 if len(weld) else 1
-    # Of triangles over the same three points, keep one.
-    s = np.sort(w[alive], axis=1)
-    order = np.argsort(_mix(s))
-    s = s[order]
-    repeated = np.zeros(len(s), bool)
-    repeated[1:] = (s[1:] == s[:-1]).all(1)
-    alive = np.sort(alive[order[~repeated]])
 
-    w = w[alive]
-    start, end = w.reshape(-1), np.roll(w, -1, axis=1).reshape(-1)
-    key = np.minimum(start, end) * n + np.maximum(start, end)
-    order = np.argsort(key, kind="stable")
-    sorted_key = key[order]
-    first = (
-        np.flatnonzero(np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]]))
-        if len(key)
-        else np.zeros(0, np.int64)
-    )
-    count = np.diff(np.append(first, len(key)))
-    h0 = order[first]
-    h1 = order[first + np.minimum(count - 1, 1)]
-    return alive[h0 // 3], h0 % 3, alive[h1 // 3], h1 % 3, count
+    point : of the vertices. If it is given, and of more than two faces at an edge all but one go on in the plane of
+        another, two of them as parts of one surface, the edge is that of the one, as of a box that stands on the edges
+        of a floor; the side that is missing repeats the other. Where two surfaces cross, both of which go on, the edge
+        is that of one of them: the line of both is found apart.
+    """
+    half = HalfEdges.of(weld, face)
+    side, first, count = half.side, half.first, half.count
+    sides = np.minimum(count, 2)
+    if point is not None:
+        # Faces in one place are two here: a bottom that lies on a floor as one of its triangles.
+        every = HalfEdges.of(weld, face, repeated=True)
+        beyond = every.beyond(face, point)
+        ends = np.sort(np.stack([face, np.roll(face, -1, axis=1)], 2).reshape(-1, 2), axis=1)
+        goes_on = beyond >= 0
+        # Where a surface has one vertex at each end, nothing jumps on it.
+        alike = goes_on & (ends == ends[beyond]).all(1)
+        of_all = lambda f, sides: f.reduceat(sides[every.side], every.first)
+        alone = (of_all(np.add, ~goes_on) == 1) & of_all(np.logical_or, alike) & (count > 2)
+        crossing = of_all(np.logical_and, alike) & (count == 4)
+        edge = np.repeat(np.arange(len(first)), count)
+        partner = np.where(crossing[edge], np.minimum(side, beyond[side]), 0)
+        side = side[np.lexsort((partner, goes_on[side] & alone[edge], edge))]
+        sides, count = np.where(alone, 1, sides), np.where(crossing, 2, count)
+    h0, h1 = side[first], side[first + sides - 1]
+    return h0 // 3, h0 % 3, h1 // 3, h1 % 3, count
 
 
 def _without_open_slivers(

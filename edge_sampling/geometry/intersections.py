@@ -1,10 +1,14 @@
 """The lines in which meshes cut through each other: boundaries that are edges of neither.
 
-Two triangles that cut each other have a piece of a line in common, along n₁ × n₂. Its ends are where an edge of one
-goes through the face of the other. So rays along all edges find the pairs of triangles: an edge that goes through a
-face makes one pair of each of its own faces with that face. Each pair is found twice, once from each end of its piece,
-and counts where it is found from the lower one. (Of triangles with a corner in common, the piece has one end there, and
-is found from the other.)
+Two triangles that cut each other have a piece of a line in common, along n₁ × n₂. Its ends are where a side of one
+goes through the face of the other. So rays along all sides of triangles find the pairs: each triangle has rays of its
+own, a little inside of it, which meet the very faces that it cuts. (On the side itself, rays would meet one of several
+faces where a side goes through the edge between them, as a box does whose corner stands on the diagonal of a floor.)
+Most pairs are found several times, and count once.
+
+A box also may stand in a floor exactly along edges of that. Both surfaces go on, so there is a line, but none of these
+triangles goes through another one. There, that which ends at the line from below stands for the surface: what is in a
+plane, within rounding, counts as above it, if the surface goes on above it.
 
 The line moves as the planes do. A point p of it has no velocity of its own along the line; across it, ṗ = α n₁ + β n₂
 with α and β such that p stays in both planes: nᵢ · ṗ = −ġᵢ, gᵢ = nᵢ · (p − cᵢ) with a corner cᵢ. What is seen on
@@ -24,7 +28,9 @@ from .boxes import box_of
 from .device_edges import rounding
 from .edges import WHOLE, EdgeKind, Edges, Weld, distinct_rows
 from .grids import is_grid
-from .meshes import Geometry, number_of, positions_of, tells_shapes_in_groups
+from .half_edges import HalfEdges, edge_key
+from .mesh_numbers import first_meshes, numbers_in_groups
+from .meshes import Geometry, positions_of, tells_shapes_in_groups
 from .rigid_motion import Shapes
 
 #: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
@@ -32,6 +38,10 @@ IN_ONE_PLANE = 1e-4
 
 #: An edge is followed through at most so many faces.
 MOST_FACES = 1024
+
+#: How far inside of its triangle a ray along a side runs, and by how much it is longer than that at both ends, in units
+#: of what rounding may be. So it goes through what ends in its triangle unless at a very flat angle.
+INSIDE, LONGER = 4, 16
 
 #: Vertices that stand for the line of one pair: its two ends, and a point on each side of it.
 VERTICES = 4
@@ -45,26 +55,13 @@ LEAST_SPACE = 64
 
 @dataclass(frozen=True)
 class _Walked:
-    """Edges along which rays are traced, on the device: their end points, the third vertices of their two faces; have
-    they two? And of which meshes these are."""
+    """Sides of triangles along which rays are traced, see `HalfEdges`: their numbers, and of which meshes they are."""
 
-    ends: list[mi.UInt32]
-    opposite: list[mi.UInt32]
-    two: mi.Bool
-    mesh: list[mi.UInt32]
-
-    @staticmethod
-    def of(edges: Edges) -> _Walked:
-        each = edges.vertices[:, 0], edges.opposite, edges.mesh
-        ends, opposite, mesh = ([_index(v[:, k]) for k in (0, 1)] for v in each)
-        return _Walked(ends, opposite, mi.Bool(edges.count > 1), mesh)
-
-    def take(self, which: mi.UInt32) -> _Walked:
-        of = lambda numbers: [dr.gather(mi.UInt32, n, which) for n in numbers]
-        return _Walked(of(self.ends), of(self.opposite), dr.gather(mi.Bool, self.two, which), of(self.mesh))
+    side: mi.UInt32
+    mesh: mi.UInt32
 
     def __len__(self) -> int:
-        return dr.width(self.two)
+        return dr.width(self.side)
 
 
 class Intersections:
@@ -83,13 +80,16 @@ class Intersections:
     straight = True
 
     def __init__(self, scene: mi.Scene, geometry: Geometry, edges: Edges, weld: Weld):
-        self._edges, self._place = edges, _index(weld.place)
-        faces = geometry.faces((True,) * len(geometry.meshes))
-        self._faces = [_index(faces[:, k]) for k in range(3)]
-        self._first_mesh = _first_meshes(geometry)
-        self._in_group = _numbers_in_groups(geometry) if tells_shapes_in_groups() else None
+        faces = geometry.faces((True,) * len(geometry.meshes)).astype(np.int64)
+        self._corner, self._place = _index(faces.ravel()), weld.place
+        self._beside = lambda: _beside(geometry, edges, weld, faces)
+        #: See there.
+        self._beyond: mi.UInt32 | None = None
+        self._jumps: mi.Bool | None = None
+        self._first_mesh = first_meshes(geometry)
+        self._in_group = numbers_in_groups(geometry) if tells_shapes_in_groups() else None
         counts = [m.face_count() for m in geometry.meshes]
-        self._first_face = _index(np.cumsum([0, *counts]))
+        self._counts, self._first_face = counts, _index(np.cumsum([0, *counts]))
         self._meshes = len(counts)
         self._walked: dict[tuple[int, ...], _Walked] = {}
         #: Where the meshes were (held, so that the number of an array is given to no other one).
@@ -125,7 +125,7 @@ class Intersections:
     def _search(self, scene: mi.Scene, positions: mi.Float, boxes: dict[int, np.ndarray]) -> None:
         """Find the pairs, and which meshes cut through themselves. boxes : meshes, and where to look for what cuts
         each: (2, 3)."""
-        walked = self._edges_of(tuple(sorted(boxes)))
+        walked = self._sides_of(tuple(sorted(boxes))) if boxes else ()
         if not len(walked):
             self._keep([], 0)
             return
@@ -137,16 +137,25 @@ class Intersections:
         ends = dr.cumsum(counts)
         count, *flags = dr.concat([dr.gather(mi.UInt32, ends, dr.width(ends) - 1), by_themselves]).numpy().tolist()
         self._by_themselves = {i for i, flag in enumerate(flags) if flag}
-        if count > self.capacity:
-            self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
-        found = [dr.zeros(mi.UInt32, max(count, 1)) for _ in range(CORNERS)]
+        found: list[mi.UInt32] = []
         if count:
             cutting = dr.compress(counts > 0)
             start = dr.gather(mi.UInt32, ends - counts, cutting)
-            self._walk(scene, positions, walked.take(cutting), within, into=found, start=start)
-            found = _each_once(found)
+            found = [dr.zeros(mi.UInt32, count) for _ in range(2)]
+            some = _Walked(*(dr.gather(mi.UInt32, n, cutting) for n in (walked.side, walked.mesh)))
+            self._walk(scene, positions, some, within, into=found, start=start)
+            found = self._each_once(found)
             count = dr.width(found[0])
+        if count > self.capacity:
+            self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
         self._keep(found, count)
+
+    def _each_once(self, found: list[mi.UInt32]) -> list[mi.UInt32]:
+        """Corners of pairs of triangles, each once, and of repeated triangles once."""
+        corners = self._corner.numpy().reshape(-1, 3)[np.stack([f.numpy() for f in found], 1)]
+        triangle = distinct_rows(np.sort(self._place[corners], axis=2).reshape(-1, 3))[1].reshape(-1, 2)
+        first = np.sort(distinct_rows(np.sort(triangle, axis=1))[0])
+        return [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)]
 
     def _keep(self, found: list[mi.UInt32], count: int) -> None:
         """Fill up what is not needed with a vertex, which makes triangles without area."""
@@ -157,10 +166,13 @@ class Intersections:
             self.corners = [dr.gather(mi.UInt32, f, slot, used) for f in found or [dr.zeros(mi.UInt32, 1)] * CORNERS]
             dr.eval(self.corners)
 
-    def _edges_of(self, meshes: tuple[int, ...]) -> _Walked:
+    def _sides_of(self, meshes: tuple[int, ...]) -> _Walked:
+        if self._beyond is None:
+            self._beyond, self._jumps = self._beside()
         if meshes not in self._walked:
-            wanted = np.isin(np.arange(self._meshes), meshes)
-            self._walked[meshes] = _Walked.of(self._edges.of_meshes(wanted))
+            mesh = np.repeat(np.arange(self._meshes), np.multiply(3, self._counts))
+            side = np.flatnonzero(np.isin(mesh, meshes))
+            self._walked[meshes] = _Walked(_index(side), _index(mesh[side]))
         return self._walked[meshes]
 
     def _walk(
@@ -174,30 +186,30 @@ class Intersections:
         start: mi.UInt32 | None = None,
         by_themselves: mi.UInt32 | None = None,
     ) -> mi.UInt32:
-        """Follow each edge through all the faces that it goes through; how many pairs it finds from their lower ends:
-        (E,).
+        """Follow each side through all the faces that it goes through; how many pairs of triangles it finds: (S,).
 
         within : for each mesh, the lower and the upper corner of a box outside of which nothing cuts it, (6 M,).
-        into, start : where to write the vertices of the pairs, from where on for each edge.
+        into, start : where to write the numbers of both triangles, from where on for each side.
         by_themselves : where to note the meshes that cut through themselves.
         """
-        point = lambda i: dr.gather(mi.Point3f, positions, i)
-        a, b = (point(e) for e in walked.ends)
-        own = [[a, b, point(o)] for o in walked.opposite]
-        ends, third = ([dr.gather(mi.UInt32, self._place, v) for v in vs] for vs in (walked.ends, walked.opposite))
+        own = walked.side // 3
+        mine = self._triangle(positions, own)
+        a, b, third = (dr.gather(mi.Point3f, positions, c) for c in self._corners_of(walked.side))
         length = dr.norm(b - a)
         d = (b - a) / length
         step = rounding(a, b)
-        active = (length > 0) & dr.isfinite(length)
-        inside = mi.Bool(False)
-        for mesh in walked.mesh:
-            lower, upper = (dr.gather(mi.Point3f, within, 2 * mesh + k) for k in (0, 1))
-            inside |= dr.all((dr.maximum(a, b) >= lower - step) & (dr.minimum(a, b) <= upper + step))
-        active &= inside
+        inwards = third - a - d * dr.dot(d, third - a)
+        height = dr.norm(inwards)
+        active = (length > 0) & dr.isfinite(length) & (height > 0)
+        lower, upper = (dr.gather(mi.Point3f, within, 2 * walked.mesh + k) for k in (0, 1))
+        active &= dr.all((dr.maximum(a, b) >= lower - step) & (dr.minimum(a, b) <= upper + step))
+        # Inside of the triangle, and a little longer than it: what ends in a face goes through that, too.
+        a = a + inwards * (dr.minimum(INSIDE * step, height / 4) / height)
+        longer = LONGER * step
 
         def through(t, count, k, active):
             ray = mi.Ray3f(mi.Point3f(a + t * d), d)
-            ray.maxt = length - t
+            ray.maxt = length + longer - t
             pi = scene.ray_intersect_preliminary(ray, active=active)
             active &= pi.is_valid()
             # In a shape group, Mitsuba numbers the shapes from 0, or tells the shape itself.
@@ -210,32 +222,62 @@ class Intersections:
                 which = dr.gather(mi.UInt32, self._in_group, shape, is_mesh & (instance != 0))
             mesh = dr.select(is_mesh, mesh - 1 + dr.select(instance != 0, which, 0), 0)
             face = dr.select(is_mesh, dr.gather(mi.UInt32, self._first_face, mesh) + pi.prim_index, 0)
-            vertices = [dr.gather(mi.UInt32, corner, face, is_mesh) for corner in self._faces]
-            places = [dr.gather(mi.UInt32, self._place, v, is_mesh) for v in vertices]
-            among = lambda corner: (places[0] == corner) | (places[1] == corner) | (places[2] == corner)
-            foreign = is_mesh & ~among(ends[0]) & ~among(ends[1])
-            other, met = [point(v) for v in vertices], ray(pi.t)
-            for side, mine in enumerate(own):
-                lower, upper, cut = common_line(mine, other)
-                # Through a corner in common, no edge goes: such a pair is found from the other end only.
-                from_lower = dr.squared_norm(met - lower) < dr.squared_norm(met - upper)
-                found = foreign & cut & (from_lower | among(third[side]))
-                if side:
-                    found &= walked.two
+            # Of the edge between two faces, a ray meets one.
+            next_to = self._next_to(positions, face, ray(pi.t), step)
+            for met in (face, next_to):
+                found = is_mesh & (met != own) & self._cut(positions, mine, own, met)
                 if by_themselves is not None:
-                    dr.scatter(by_themselves, mi.UInt32(1), mesh, found & (mesh == walked.mesh[side]))
+                    dr.scatter(by_themselves, mi.UInt32(1), mesh, found & (mesh == walked.mesh))
                 if into is not None:
-                    pair = (*walked.ends, walked.opposite[side], *vertices)
-                    for target, v in zip(into, pair, strict=True):
-                        dr.scatter(target, v, start + count, found)
+                    for target, triangle in zip(into, (own, met), strict=True):
+                        dr.scatter(target, triangle, start + count, found)
                 count += dr.select(found, 1, 0)
+                is_mesh &= next_to != face
             t += pi.t + step
-            return t, count, k + 1, active & (t < length) & (k < MOST_FACES)
+            return t, count, k + 1, active & (t < length + longer) & (k < MOST_FACES)
 
         width = len(walked)
         zero = dr.zeros(mi.UInt32, width)
-        state = (dr.zeros(mi.Float, width), mi.UInt32(zero), mi.UInt32(zero), active)
-        return dr.while_loop(state, lambda *s: s[-1], through, label="edges through faces")[1]
+        state = (mi.Float(-longer), mi.UInt32(zero), mi.UInt32(zero), active)
+        return dr.while_loop(state, lambda *s: s[-1], through, label="sides of triangles through faces")[1]
+
+    def _corners_of(self, side: mi.UInt32) -> list[mi.UInt32]:
+        """Vertices of a triangle, those of a side of it first."""
+        face, k = side // 3, side % 3
+        return [dr.gather(mi.UInt32, self._corner, 3 * face + (k + i) % 3) for i in range(3)]
+
+    def _triangle(self, positions: mi.Float, face: mi.UInt32) -> list[mi.Point3f]:
+        return [dr.gather(mi.Point3f, positions, c) for c in self._corners_of(3 * face)]
+
+    def _next_to(self, positions: mi.Float, face: mi.UInt32, p: mi.Point3f, slack: mi.Float) -> mi.UInt32:
+        """The face beyond that side of a face on which the point p is; the face itself where it is on none."""
+        corners, found = self._triangle(positions, face), mi.UInt32(face)
+        for k in range(3):
+            a, b = corners[k], corners[(k + 1) % 3]
+            near = dr.norm(dr.cross(p - a, b - a)) <= slack * dr.norm(b - a)
+            found = dr.select(near, dr.gather(mi.UInt32, self._beyond, 3 * face + k) // 3, found)
+        return found
+
+    def _cut(self, positions: mi.Float, mine: list[mi.Point3f], own: mi.UInt32, met: mi.UInt32) -> mi.Bool:
+        """Do two triangles cut each other? mine : corners of the first."""
+        other = self._triangle(positions, met)
+        slack = _slack(mine, other)
+        cut = common_line(mine, other)[2]
+        for face, corners, plane in ((own, mine, other), (met, other, mine)):
+            n = _normal(plane)
+            height = lambda p, n=n, plane=plane: dr.dot(n, p - plane[0])
+            heights = [height(p) for p in corners]
+            goes_through = (heights[0] > slack) | (heights[1] > slack) | (heights[2] > slack)
+            for k in range(3):
+                i, j = k, (k + 1) % 3
+                side = 3 * face + k
+                beyond = self._corners_of(dr.gather(mi.UInt32, self._beyond, side))[2]
+                q = dr.gather(mi.Point3f, positions, beyond)
+                flat = dr.norm(dr.cross(_normal(corners), _normal([corners[i], corners[j], q]))) <= IN_ONE_PLANE
+                in_plane = (dr.abs(heights[i]) <= slack) & (dr.abs(heights[j]) <= slack)
+                goes_through |= in_plane & (height(q) > slack) & flat & ~dr.gather(mi.Bool, self._jumps, side)
+            cut &= goes_through
+        return cut
 
     # ---------------------- As edges ----------------------
 
@@ -295,18 +337,23 @@ def line_edges(edges: Edges, n: int, vertices: int) -> Edges:
     return edges + lines
 
 
-def _each_once(found: list[mi.UInt32]) -> list[mi.UInt32]:
-    """Pairs of triangles, each once: where the edges of two meshes meet, both find the pair from the same end."""
-    corners = np.stack([f.numpy() for f in found], 1).reshape(-1, 3)
-    triangle = distinct_rows(np.sort(corners, axis=1))[1].reshape(-1, 2)
-    first = np.sort(distinct_rows(np.sort(triangle, axis=1))[0])
-    return [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)]
+def _beside(geometry: Geometry, edges: Edges, weld: Weld, faces: np.ndarray) -> tuple[mi.UInt32, mi.Bool]:
+    """Of each side of a triangle, that beyond it, or itself where there is none; and whether the edge is a jump by
+    itself, which a line along it would only repeat: (3 F,)."""
+    beyond = HalfEdges.of(weld.place, faces).beyond(faces, geometry.host_positions())
+    beyond = np.where(beyond < 0, np.arange(faces.size), beyond)
+    n = int(weld.place.max()) + 1
+    key = lambda ends: edge_key(*weld.place[ends.astype(np.int64)].T, n)
+    goes_on = key(edges.vertices[edges.kind != EdgeKind.JUMP, 0])
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], 2).reshape(-1, 2)
+    return _index(beyond), mi.Bool(np.isin(key(sides), goes_on, invert=True))
 
 
 def common_line(first: list[mi.Point3f], second: list[mi.Point3f]) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
     """Lower and upper end of the piece of a line that two triangles have in common; do they cut each other? Detached.
 
-    The same for the triangles in another order, but for rounding. Triangles that only touch do not cut each other.
+    The same for the triangles in another order, but for rounding. What is in a plane, within rounding, counts as above
+    it: so triangles that only touch may be said to cut each other.
     """
     normals = _normal(first), _normal(second)
     along = dr.cross(*normals)
@@ -315,10 +362,11 @@ def common_line(first: list[mi.Point3f], second: list[mi.Point3f]) -> tuple[mi.P
     size = dr.abs(along)
     largest = dr.select(size.x >= dr.maximum(size.y, size.z), along.x, dr.select(size.y >= size.z, along.y, along.z))
     along = dr.mulsign(dr.normalize(along), largest)
-    slack = dr.maximum(rounding(first[0], second[0]), dr.maximum(rounding(*first[1:]), rounding(*second[1:])))
-    ends = []
+    slack, ends = _slack(first, second), []
     for triangle, n, other in ((first, normals[1], second), (second, normals[0], first)):
-        a, b, crosses = cut_by_plane(triangle, [dr.dot(n, p - other[0]) for p in triangle], slack)
+        heights = [dr.dot(n, p - other[0]) for p in triangle]
+        above = dr.smallest(mi.Float)
+        a, b, crosses = cut_by_plane(triangle, [dr.select(dr.abs(h) <= slack, above, h) for h in heights])
         cut &= crosses
         swap = dr.dot(along, a - b) > 0
         ends.append((dr.select(swap, b, a), dr.select(swap, a, b)))
@@ -327,16 +375,16 @@ def common_line(first: list[mi.Point3f], second: list[mi.Point3f]) -> tuple[mi.P
     return lower, upper, cut & (dr.dot(along, upper - lower) > slack)
 
 
-def cut_by_plane(
-    corners: list[mi.Point3f], height: list[mi.Float], slack: mi.Float | float = 0.0
-) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
-    """Where a plane cuts through a triangle: two points of its sides; and does it?
+def _slack(first: list[mi.Point3f], second: list[mi.Point3f]) -> mi.Float:
+    """How far from a plane of one of two triangles a corner of the other may seem to lie that is in it."""
+    return dr.maximum(rounding(first[0], second[0]), dr.maximum(rounding(*first[1:]), rounding(*second[1:])))
 
-    height : of the corners over the plane. slack : of them that is taken for 0.
-    """
+
+def cut_by_plane(corners: list[mi.Point3f], height: list[mi.Float]) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
+    """Where a plane cuts through a triangle: two points of its sides; and does it? height : of the corners over it."""
     corners, height = list(corners), list(height)
-    above = [h > slack for h in height]
-    below = [h < -slack for h in height]
+    above = [h > 0 for h in height]
+    below = [h < 0 for h in height]
     crosses = (above[0] | above[1] | above[2]) & (below[0] | below[1] | below[2])
     # The corner that has the plane between itself and the two others, first.
     for k in (1, 2):
@@ -393,25 +441,6 @@ def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:
         return {}
     lower, upper = np.maximum(lower[:, None], lower), np.minimum(upper[:, None], upper)
     return {i: np.array([lower[i, row].min(0), upper[i, row].max(0)]) for i, row in enumerate(overlap) if row.any()}
-
-
-def _first_meshes(geometry: Geometry) -> mi.UInt32:
-    """By the number that Dr.Jit gives to a shape: that of its mesh, or of an instance's first one, plus 1. Else 0."""
-    numbers = [0 if is_grid(m) else number_of(getattr(m, "instance", m)) for m in geometry.meshes]
-    table = np.zeros(max(numbers, default=0) + 1, np.uint32)
-    table[numbers[::-1]] = np.arange(len(numbers), 0, -1)
-    table[0] = 0
-    return mi.UInt32(table)
-
-
-def _numbers_in_groups(geometry: Geometry) -> mi.UInt32:
-    """By the number that Dr.Jit gives to a shape in a group: which of the meshes of its group it is."""
-    inner = [(id(m.instance), number_of(m.inner)) for m in geometry.meshes if hasattr(m, "instance")]
-    table = np.zeros(max((number for _, number in inner), default=0) + 1, np.uint32)
-    seen: dict[int, int] = {}
-    for instance, number in inner:
-        table[number] = seen[instance] = seen.get(instance, -1) + 1
-    return mi.UInt32(table)
 
 
 def _index(numbers: np.ndarray) -> mi.UInt32:

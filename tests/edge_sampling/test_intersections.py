@@ -115,6 +115,65 @@ def test_what_only_touches_does_not_cut():
     assert lines.capacity == lines.count == 0
 
 
+def tiles(n: int, y: float = 0.0, turn: int = 0) -> mi.Mesh:
+    """n × n squares of side 1 around the origin, of two triangles each, looking up, or down if `turn` is −1."""
+    at = np.arange(n + 1) - n / 2
+    corners = np.array([[x, y, z] for z in at for x in at])
+    first = [j * (n + 1) + i for j in range(n) for i in range(n)]
+    faces = np.array([f for a in first for f in ([a, a + n + 1, a + 1], [a + 1, a + n + 1, a + n + 2])])
+    return mesh("tiles", corners, faces[:, ::-1] if turn < 0 else faces, bsdf=diffuse(0.5))
+
+
+def upright_box(low: tuple, high: tuple, rows: int = 1) -> mi.Mesh:
+    """A box whose four sides are divided into rows."""
+    round_ = [(low[0], low[2]), (high[0], low[2]), (high[0], high[2]), (low[0], high[2])]
+    corners = [[x, y, z] for y in np.linspace(low[1], high[1], rows + 1) for x, z in round_]
+    faces = [[0, 1, 2], [0, 2, 3], [4 * rows, 4 * rows + 2, 4 * rows + 1], [4 * rows, 4 * rows + 3, 4 * rows + 2]]
+    for a, b in ((4 * r + k, 4 * r + (k + 1) % 4) for r in range(rows) for k in range(4)):
+        faces += [[a, a + 4, b], [b, a + 4, b + 4]]
+    return mesh("box", corners, faces, bsdf=diffuse(0.5))
+
+
+@pytest.mark.parametrize("down", [False, True])
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize(
+    ("n", "low", "high"),
+    [
+        (1, (-0.3, -0.4, -0.3), (0.3, 0.4, 0.3)),  # corners on the diagonal of a square
+        (4, (-1, -0.5, -1), (1, 0.5, 1)),  # along edges, with corners in common if there are two rows
+        (4, (-1, -0.5, -0.7), (1, 0.5, 0.3)),
+        (5, (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)),  # around one square
+    ],
+)
+def test_a_box_in_the_edges_of_a_floor(n, low, high, rows, down):
+    floor, box = tiles(n, turn=-down), upright_box(low, high, rows)
+    lines, geometry = intersections(scene(floor=floor, box=box))
+    expected = 2 * (high[0] - low[0] + high[2] - low[2])
+    assert length(pieces(lines, geometry)) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("down", [False, True])
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("above", [False, True])
+def test_a_box_on_the_edges_of_a_floor_does_not_cut_it(above, rows, down):
+    low, high = ((-1, 0, -1), (1, 1, 1)) if above else ((-1, -1, -1), (1, 0, 1))
+    lines, _ = intersections(scene(floor=tiles(4, turn=-down), box=upright_box(low, high, rows)))
+    assert lines.shapes
+    assert lines.count == 0
+
+
+@pytest.mark.parametrize("first", ["box", "floor"])
+def test_whose_edges_a_box_has_that_stands_on_those_of_a_floor(first):
+    shapes = {"floor": tiles(4), "box": upright_box((0, 0, 0), (1, 1, 1))}
+    geometry = Geometry.of(scene(**dict(sorted(shapes.items(), key=lambda item: item[0] != first))))
+    edges, _ = find_welded_edges(geometry)
+    positions = geometry.host_positions()[edges.vertices[:, 0]]
+    foot = (positions[..., 1] == 0).all(1) & (edges.count > 2)
+    foot &= (positions[:, 0, 0] == positions[:, 1, 0]) | (positions[:, 0, 2] == positions[:, 1, 2])
+    assert foot.sum() == 4
+    assert {geometry.meshes[i].id() for i in edges.mesh[foot].ravel()} == {"box"}
+
+
 def test_a_mesh_that_cuts_through_itself():
     vertices = np.concatenate([cube_vertices(), np.add(cube_vertices(), [0.5, 0.3, 0.2])])
     both = mesh("both", vertices, [*CUBE_FACES, *(np.array(CUBE_FACES) + 8)], bsdf=diffuse(0.5))

@@ -18,7 +18,7 @@ from rimlight.checks import Motion, derivative_image
 from rimlight.edge_sampling.geometry.instances import Instances
 from rimlight.edge_sampling.geometry.instances import _first_met as found_by_first_shape
 from rimlight.edge_sampling.geometry.instances import _named as found_by_name
-from rimlight.edge_sampling.geometry.intersections import _numbers_in_groups as numbers_in_groups
+from rimlight.edge_sampling.geometry.mesh_numbers import numbers_in_groups
 from rimlight.edge_sampling.geometry.meshes import number_of
 
 INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 3}}
