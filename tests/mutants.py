@@ -291,8 +291,8 @@ MUTANTS = [
     mutant(
         "film boundary: lines in which meshes cut each other count where something hides them",
         "edge_sampling/geometry/device_edges.py",
-        "dr.select(line, self._is_hidden_line(positions, edge, p, rays, met), hidden) if self._any_lines else hidden",
-        "hidden & ~line",
+        "hidden = dr.select(of(self._is_line), self._is_hidden_line(positions, edge, p, rays, met), hidden)",
+        "hidden &= ~of(self._is_line)",
     ),
     mutant(
         "film boundary: curves in which spheres cut other shapes follow one of both only",
@@ -303,8 +303,8 @@ MUTANTS = [
     mutant(
         "film boundary: silhouettes that lie exactly behind others count",
         "edge_sampling/geometry/device_edges.py",
-        "~(shown[0] & shown[1]), covered & ~(shown[0] | shown[1]))",
-        "~(shown[0] & shown[1]), False)",
+        "covered = (covers[0] | covers[1]) & ~(shown[0] | shown[1])",
+        "covered = mi.Bool(False)",
     ),
     mutant(
         "film boundary: a face that is seen edge-on faces away for one of its borders only",
@@ -506,8 +506,38 @@ MUTANTS = [
     mutant(
         "edges: things side by side keep edges of their own",
         "edge_sampling/geometry/cracks.py",
-        "edges.open | _beside_others(geometry, edges)",
+        "edges.open | _beside_others(geometry, edges, weld.surface)",
         "edges.open",
+    ),
+    mutant(
+        "intersections: lines that run along the edges of a floor are lost",
+        "edge_sampling/geometry/intersections.py",
+        "goes_through |= in_plane & (height(q) > slack) & flat & ~dr.gather(mi.Bool, self._jumps, side)",
+        "pass",
+    ),
+    mutant(
+        "intersections: what only touches cuts",
+        "edge_sampling/geometry/intersections.py",
+        "            cut &= goes_through",
+        "            pass",
+    ),
+    mutant(
+        "edges: a box on the edges of a floor moves with these",
+        "edge_sampling/geometry/edges.py",
+        "sides, count = np.where(alone, 1, sides), np.where(crossing, 2, count)",
+        "side, count = half.side, np.where(crossing, 2, count)",
+    ),
+    mutant(
+        "film boundary: edges at which many faces meet count where something hides them",
+        "edge_sampling/geometry/device_edges.py",
+        "hidden = dr.select(of(self._few_faces), hidden, ~reached)",
+        "hidden &= of(self._few_faces)",
+    ),
+    mutant(
+        "shadows from lights: sides of boxes that stand flush throw shadows on each other",
+        "edge_sampling/boundaries/fallen_shadow.py",
+        "edge.outline.is_behind(hit.n, ω, flush)",
+        "edge.outline.is_behind(hit.n, ω)",
     ),
     mutant(
         "shadows from lights: all edges in one plane with the light count",

@@ -158,8 +158,7 @@ class DeviceEdges:
         edge does, as in views along an axis of symmetry, or so close to it that it passes between the rays. Of an edge
         that is no silhouette, both faces must be seen, which excludes those at so grazing an angle that a ray has left
         its face, and met what lies beyond the face's other edges. A silhouette must be seen if a ray passes through
-        both of its faces, as it does unless one is narrower than the rays are apart. Where more faces meet, a ray must
-        meet a surface in whose plane the edge is.
+        both of its faces, unless one is narrower than the rays are apart. Where more meet, a ray must meet its plane.
 
         p : a point of the edge that the rays pass, world space. eye, view : see `is_boundary`.
         met : what the rays meet. What lets rays through hides nothing. farther : how much farther they may be from the
