@@ -162,9 +162,8 @@ def look(
     )
     ray = dr.detach(ray)
     seen = tracer.first_hit(ray, active)
+    active &= seen.is_valid() & (seen.shape == shadow.shape)
     si = seen.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    # Of two shapes in one place, rays may meet either.
-    active &= seen.is_valid() & ((seen.shape == shadow.shape) | (dr.abs_dot(si.n, shadow.facing) > GOES_ON))
     # It sees this place, and nothing that lies before it: where the surface is curved, x was moved a little off it, but
     # less than the ray will start above it.
     active &= dr.abs_dot(si.n, x - si.p) <= shadow.lift + rounding(x, ray.o)

@@ -224,15 +224,14 @@ class Intersections:
             face = dr.select(is_mesh, dr.gather(mi.UInt32, self._first_face, mesh) + pi.prim_index, 0)
             # Of the edge between two faces, a ray meets one.
             next_to = self._next_to(positions, face, ray(pi.t), step)
-            for met in (face, next_to):
-                found = is_mesh & (met != own) & self._cut(positions, mine, own, met)
+            for met, new in ((face, is_mesh), (next_to, is_mesh & (next_to != face))):
+                found = new & (met != own) & self._cut(positions, mine, own, met)
                 if by_themselves is not None:
                     dr.scatter(by_themselves, mi.UInt32(1), mesh, found & (mesh == walked.mesh))
                 if into is not None:
                     for target, triangle in zip(into, (own, met), strict=True):
                         dr.scatter(target, triangle, start + count, found)
                 count += dr.select(found, 1, 0)
-                is_mesh &= next_to != face
             t += pi.t + step
             return t, count, k + 1, active & (t < length + longer) & (k < MOST_FACES)
 
