@@ -284,7 +284,7 @@ MUTANTS = [
     ),
     mutant(
         "shadows: looks 24 times as far aside",
-        "edge_sampling/geometry/device_edges.py",
+        "edge_sampling/geometry/beside.py",
         "return 0.25 * rounding(p, q)",
         "return 6 * rounding(p, q)",
     ),
@@ -307,10 +307,34 @@ MUTANTS = [
         "covered = mi.Bool(False)",
     ),
     mutant(
-        "film boundary: a face that is seen edge-on faces away for one of its borders only",
+        "film boundary: borders of a face that is seen edge-on count where something is before them",
         "edge_sampling/geometry/device_edges.py",
-        "(-dr.dot(second, towards) > least * dr.norm(second))",
-        "(-dr.dot(second, towards) > -least * dr.norm(second))",
+        "(edge_on[0] | edge_on[1]) & (before | ~reached)",
+        "(edge_on[0] | edge_on[1]) & ~reached",
+    ),
+    mutant(
+        "film boundary: borders of a face that is seen edge-on count where they are in the air",
+        "edge_sampling/geometry/device_edges.py",
+        "(edge_on[0] | edge_on[1]) & (before | ~reached)",
+        "(edge_on[0] | edge_on[1]) & before",
+    ),
+    mutant(
+        "film boundary: both halves of a rim that is seen edge-on count",
+        "edge_sampling/boundaries/film_boundary.py",
+        "seen &= through | ~nearer",
+        "pass",
+    ),
+    mutant(
+        "film boundary: rims of a wall that is seen edge-on count where they are in the air",
+        "edge_sampling/boundaries/film_boundary.py",
+        "(seen & (reached | ~edge_on[0] | ~edge_on[1]))",
+        "seen",
+    ),
+    mutant(
+        "shadows from lights: of a face along which light shines, only one border throws a shadow",
+        "edge_sampling/boundaries/shadow_boundary.py",
+        "outline.outward(across, ω, either=True)",
+        "outline.outward(across, ω)",
     ),
     mutant(
         "lines of textures: looked at as closely as they are found",

@@ -44,6 +44,15 @@ class TidyGenerator(PatternGenerator):
             # In front of all, on the axis
             sensor["to_world"] = self.look([0, self.pick(0.85, 1.35), 4.6], [0, self.pick(0.35, 0.85), 0])
             self.labels[-1] += "/along"
+        #: Is it a front view, or a plan, in which faces are seen edge-on?
+        self.upright = sensor["type"] == "orthographic" and self.chance(0.7)
+        if self.upright:
+            origin, up = self.pick(([0.1, 0.5, 4.6], (0, 1, 0)), ([0.1, 4.6, 0.2], (0, 0, -1)))
+            target = origin * np.array([1, up[1], up[2] != 0])
+            size = 1.7 * self.scale
+            sensor["to_world"] = self.look(origin, target, up) @ mi.ScalarTransform4f().scale([size, size, 1])
+            self.movable["camera"] = [("sensor.to_world", "along", np.zeros(3))]
+            self.labels[-1] += "/front" if up[1] else "/plan"
 
     def make_floor(self) -> None:
         kind, bsdf = self.bsdf(uv=True)
@@ -130,7 +139,7 @@ class TidyGenerator(PatternGenerator):
 
     def make_motion(self, scene: mi.Scene, cameras: bool) -> tuple[mi.SceneParameters, Callable[[mi.Float], None]]:
         if not self.movable["thing"]:
-            self.movable["thing"] = [m for m in self.movable["camera"] if m[1] == "pose"]
+            self.movable["thing"] = [m for m in self.movable["camera"] if m[1] in ("pose", "along")]
         return super().make_motion(scene, cameras)
 
     def mover(self, params, key: str, how: str, centre) -> Callable[[mi.Float], None]:
@@ -140,7 +149,7 @@ class TidyGenerator(PatternGenerator):
         way, turn = self.direction() * [1, 0, 1], self.uniform(-20, 20)
         if how != "slides" or self.in_row:
             way, turn = np.array([1.0, 0, 0] if how == "along" else [0, 0, 1.0]), 0.0
-        if self.along or "wall" in self.objects:
+        if self.along or self.upright or "wall" in self.objects:
             turn = 0.0
         about, way = (mi.Vector3f(*map(float, v)) for v in (self.place(centre), way * self.scale))
 

@@ -109,6 +109,55 @@ def books() -> mi.Scene:
     return seen(floor=floor(), sun=sun(0, -1, 0), **{k: block(k, *size, colours[k]) for k, size in sizes.items()})
 
 
+def elevation(origin: tuple, target: tuple, up: tuple) -> dict:
+    """An orthographic camera, which sees faces edge-on."""
+    T = mi.ScalarTransform4f
+    to_world = T().look_at(list(origin), list(target), list(up)) @ T().scale([1.31, 1.31, 1])
+    return {**camera(kind="orthographic"), "to_world": to_world}
+
+
+def tin(x: float, z: float, lid: bool) -> dict:
+    """A cylinder that stands on the floor."""
+    centre = [x, 0.6, z]
+    wall = {"type": "cylinder", "p0": [x, 0, z], "p1": centre, "radius": 0.3, "bsdf": diffuse(0.6, two_sided=True)}
+    place = mi.ScalarTransform4f().translate(centre).rotate([1, 0, 0], -90).scale(0.3)
+    disk = {"type": "disk", "to_world": place, "bsdf": diffuse(0.3, two_sided=True)}
+    return {"tin": wall, "lid": disk} if lid else {"tin": wall}
+
+
+def bent_sheet(reverse: bool) -> mi.Mesh:
+    """A roof with a wall below one of its sides."""
+    corners = [[x, y, z] for x, y in ((-1.2, 0.8), (-0.8, 0.8), (-0.8, 0.1)) for z in (-0.5, 0.5)]
+    faces = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    return mesh("sheet", corners, faces[:, ::-1] if reverse else faces, bsdf=diffuse(0.7, two_sided=True))
+
+
+def front_view() -> mi.Scene:
+    """Two boxes, one behind the other, and a can, seen along the floor and along their sides."""
+    at = elevation((0.037, 0.613, -4), (0.037, 0.613, 0), (0, 1, 0))
+    one = block("one", (-0.6, 0, -0.5), (-0.1, 0.8, 0.5), 0.7, 0.2, 0.2)
+    two = block("two", (-0.1, 0, 0), (0.4, 0.8, 0.8), 0.2, 0.2, 0.7)
+    light = {"sun": sun(0.3, -1, 0.5), "sky": constant(0.1)}
+    return scene(sensor=at, floor=floor(), one=one, two=two, **tin(0.8, 0, True), **light)
+
+
+def plan() -> mi.Scene:
+    """Two boxes of different height, a wall without thickness, a bent sheet and an open can, seen from above."""
+    at = elevation((0.037, 4, 0.013), (0.037, 0, 0.013), (0, 0, 1))
+    one = block("one", (-0.5, 0, -0.43), (-0.1, 0.5, 0.41), 0.7, 0.2, 0.2)
+    two = block("two", (-0.1, 0, -0.43), (0.3, 0.8, 0.41), 0.2, 0.2, 0.7)
+    wall = quad((-0.5, 0, 0.93), (0.9, 0, 0), (0, 0.6, 0), "wall", bsdf=diffuse(0.6, two_sided=True))
+    things = {"one": one, "two": two, "wall": wall, "sheet": bent_sheet(False), **tin(0.8, 0.1, False)}
+    return scene(sensor=at, floor=floor(), **things, sun=sun(0.3, -1, 0.5), sky=constant(0.1))
+
+
+def inside_out() -> mi.Scene:
+    """A box and a bent sheet whose normals point inwards, in a sun that shines along their sides."""
+    points, _, _, faces = box((-0.3, 0.2, -0.5), (0.5, 0.8, 0.5))
+    shape = mesh("box", points, np.array(faces)[:, ::-1], bsdf=diffuse(0.6, two_sided=True))
+    return seen(floor=floor(), box=shape, sheet=bent_sheet(True), sun=sun(0, -1, 0))
+
+
 CAMERA = {"key": "sensor.to_world", "direction": [1, 0.3, 0.2]}
 
 BOX = {"key": "box.vertex_positions", "direction": [1, 0, 0.4]}
@@ -124,4 +173,7 @@ TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
     "box_on_corners": (box_on_corners, BOX, 2e-3),
     "steps": (steps, CAMERA, 2e-3),
     "books": (books, CAMERA, 2e-3),
+    "front_view": (front_view, {**CAMERA, "direction": [1, 0.3, 0]}, 2e-3),
+    "plan": (plan, {**CAMERA, "direction": [1, 0, 0.4]}, 2e-3),
+    "inside_out": (inside_out, CAMERA, 2e-3),
 }

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.sampling import EdgeSample
 from rimlight.edge_sampling.choice.silhouettes import OutlinePoint
-from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, beside_edge, rounding
+from rimlight.edge_sampling.geometry.beside import beside_edge, rounding
 from rimlight.edge_sampling.geometry.surfaces import GOES_ON
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 from rimlight.edge_sampling.rays import rough_size, spawn_ray
@@ -130,9 +130,8 @@ def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
 def _in_front(scene: mi.Scene, light: LightPoint, edge: LitEdge, aside: mi.Vector3f, active: mi.Bool) -> mi.Bool:
     """Of an edge with a face along which light shines: is something else in front of that face, which throws the same
     shadow? Several edges in one plane with the light do, of which the first counts."""
-    grazes = mi.Bool(False)
-    for n in edge.outline.normals:
-        grazes |= dr.abs_dot(n, edge.d) <= 4 * EDGE_ON * dr.norm(n) * dr.norm(edge.d)
+    edge_on = edge.outline.are_edge_on(edge.d)
+    grazes = edge_on[0] | edge_on[1]
     d = dr.select(light.far, -edge.ω, light.y - edge.p)
     along = dr.normalize(d)
     # As far as a ray may go below what is curved and touches the plane: beside it, that is as wide as the root of this.

@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.first_points import FirstPoints
-from rimlight.edge_sampling.geometry.device_edges import line_of_sight, rounding
+from rimlight.edge_sampling.geometry.beside import are_edge_on, compare_depth, line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
 from rimlight.edge_sampling.geometry.surfaces import GOES_ON
@@ -307,15 +307,31 @@ class FilmBoundary:
             across = lambda v: dr.dot(projection.tangent(c.p, mi.Point3f(c.p + v), mi.Float(0), at.aperture_sample), n)
             missed = [outlines.curves.misses(at.frames, chosen.piece, ray) for ray in rays]
             jumps &= ~chosen.is_curve | ~dr.select(across(c.inwards) > 0, missed[1], missed[0])
-            if outlines.curves.any_joined:
-                # Between rims that coincide, rounding may let a ray through.
-                joined = chosen.is_curve & outlines.curves.joined(chosen.piece)
-                faces, blur = (across(c.inwards), across(c.other)), self._blur(at, chosen, found)
-                for sign, ray, pi in zip((-1, 1), rays, met, strict=True):
-                    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, joined)
-                    there = si.is_valid() & (dr.abs_dot(si.n, si.p - p) <= rounding(p, ray.o) + blur)
-                    jumps &= ~joined | there | ((sign * faces[0] < 0) & (sign * faces[1] < 0))
+            jumps &= self._is_seen_rim(at, chosen, found, p, rays, met, across)
         return jumps
+
+    def _is_seen_rim(self, at: Placed, chosen: Chosen, found: Found, p, rays, met, across) -> mi.Bool:
+        """Is a point of a rim seen, and not another rim, or another part of it, at the same place of the film? All that
+        is on no rim counts as seen.
+
+        across : how far a vector from the point goes across the rim on the film.
+        """
+        c, curves = found.curve, self.outlines.curves
+        rim, slack = chosen.is_curve & ~c.slides, self._blur(at, chosen, found) + rounding(p, rays[0].o)
+        faces = c.inwards, c.other
+        edge_on = [are_edge_on(dr.cross(c.tangent, v), rays[0].d) for v in faces]
+        seen, reached = mi.Bool(True), mi.Bool(False)
+        for sign, ray, pi in zip((-1, 1), rays, met, strict=True):
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, rim)
+            through = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
+            at_p, nearer = compare_depth(p, ray, si, slack)
+            seen &= through | ~nearer
+            reached |= through | at_p
+            if curves.any_joined:
+                # Between rims that coincide, rounding may let a ray through.
+                bare = [(sign * across(v) < 0) | on for v, on in zip(faces, edge_on, strict=True)]
+                seen &= ~curves.joined(chosen.piece) | at_p | (bare[0] & bare[1])
+        return ~rim | (seen & (reached | ~edge_on[0] | ~edge_on[1]))
 
     def _sides_of_horizons(self, at: Placed, chosen: Chosen, found: Found, p, rays, met) -> list[Horizon | None]:
         """On which side of a horizon of interpolated normals each of two rays is. A contour is such a horizon, too: of

@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from rimlight.edge_sampling.choice.sampling import EdgeSample
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
-from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.beside import rounding
 from rimlight.edge_sampling.parametrisation import material_point
 
 from .indirect_shadows import Join, held_point

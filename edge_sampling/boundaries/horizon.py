@@ -28,7 +28,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.beside import rounding
 from rimlight.edge_sampling.geometry.grids import is_grid
 from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped, is_smooth
 

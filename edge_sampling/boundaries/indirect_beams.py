@@ -14,7 +14,7 @@ import mitsuba as mi
 from rimlight.edge_sampling.choice.sampling import EdgeSample
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.geometry.beams import ROUNDING
-from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.beside import rounding
 from rimlight.edge_sampling.geometry.texture_lines import lines_of_beam
 
 from .beam_lines import BeamLines

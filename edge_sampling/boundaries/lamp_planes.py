@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.choice.sampling import power_heuristic
-from rimlight.edge_sampling.geometry.device_edges import beside_edge
+from rimlight.edge_sampling.geometry.beside import beside_edge
 from rimlight.edge_sampling.geometry.meshes import Geometry, is_flipped
 from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.projection.sensors import Projection

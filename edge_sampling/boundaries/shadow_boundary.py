@@ -27,7 +27,7 @@ from rimlight.edge_sampling.choice.emitter_boxes import SLACK
 from rimlight.edge_sampling.choice.sampling import EdgeSample, power_heuristic
 from rimlight.edge_sampling.choice.silhouettes import Placement, Silhouettes
 from rimlight.edge_sampling.choice.views import Cone, View
-from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.beside import rounding
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.projection.sensors import Projection
@@ -254,7 +254,7 @@ class ShadowBoundary:
         d = dr.select(far, -mi.Vector3f(y), outline.p - y)
         ω = dr.normalize(d)
         across = dr.normalize(dr.cross(ω, outline.tangent))
-        lit = across * outline.outward(across, ω)
+        lit = across * outline.outward(across, ω, either=True)
         emits = dr.select(light.on_surface, dr.dot(light.n, ω), 1) > 0
         active = (e.density > 0) & emits & dr.any(lit != 0)
         return LitEdge(e, outline.p, outline.tangent, lit, d, ω, active, outline, outline.slack, outline.sign)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.beside import rounding
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.rays import spawn_ray_to_light, starts_in
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.geometry.device_edges import rounding
+from rimlight.edge_sampling.geometry.beside import rounding
 from rimlight.edge_sampling.parametrisation import material_point
 
 #: Barycentric coordinate from which on a point is taken to lie inside of a triangle.

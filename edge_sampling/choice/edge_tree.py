@@ -15,7 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._collection import no_collection
-from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, DeviceEdges
+from rimlight.edge_sampling.geometry.beside import EDGE_ON
+from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
 

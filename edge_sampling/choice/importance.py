@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.geometry.device_edges import EDGE_ON
+from rimlight.edge_sampling.geometry.beside import EDGE_ON
 
 from .edge_tree import Node, Slot
 from .on_edge import MARGIN, along_and_off, falloff, is_silhouette, narrow, part_in_view

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from rimlight.edge_sampling.geometry.device_edges import EDGE_ON
+from rimlight.edge_sampling.geometry.beside import EDGE_ON
 
 from .edge_tree import Slot
 from .views import Cone, Lobe, View

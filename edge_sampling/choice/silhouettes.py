@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.geometry.beside import are_edge_on, beside_edge
 from rimlight.edge_sampling.geometry.curves import PIECES, Curves
-from rimlight.edge_sampling.geometry.device_edges import EDGE_ON, beside_edge
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import Geometry, inner
@@ -66,18 +66,25 @@ class OutlinePoint:
         """Normals of the faces on both sides of an edge: of equal sense, not normalised."""
         return dr.cross(self.tangent, self.inwards[0]), dr.cross(self.inwards[1], self.tangent)
 
-    def outward(self, across: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
+    def are_edge_on(self, d: mi.Vector3f) -> list[mi.Bool]:
+        """Which of its two faces are seen edge-on along d, up to rounding?"""
+        return [are_edge_on(n, d) for n in self.normals]
+
+    def outward(self, across: mi.Vector3f, d: mi.Vector3f, either: bool = False) -> mi.Float:
         """The side of a silhouette on which its faces are not: the sign of `across`, (N,); 0 where they are on both.
 
-        A face that is seen edge-on faces away, as `DeviceEdges.is_silhouette` has it.
-
-        across : a direction across the edge and the line of sight. d : along that, from the viewer.
+        across : a direction across the edge and the line of sight. d : along that, from the viewer. either : is an edge
+            with one face that is seen edge-on a silhouette whatever the other one does? Otherwise, such a face faces
+            away.
         """
-        least = EDGE_ON * dr.norm(d)
-        faces = [-dr.dot(n, d) > least * dr.norm(n) for n in self.normals]
+        edge_on = self.are_edge_on(d)
+        faces = [(dr.dot(n, d) < 0) & ~on for n, on in zip(self.normals, edge_on, strict=True)]
+        differ = faces[0] != faces[1]
+        if either:
+            differ |= edge_on[0] != edge_on[1]
         inwards = [dr.dot(v, across) for v in self.inwards]
         inwards = dr.select(dr.abs(inwards[0]) > dr.abs(inwards[1]), inwards[0], inwards[1])
-        outward = dr.select(faces[0] != faces[1], -dr.sign(inwards), 0)
+        outward = dr.select(differ, -dr.sign(inwards), 0)
         # What is bent inwards is seen from the side of its faces.
         return dr.select(self.concave, -outward, outward)
 

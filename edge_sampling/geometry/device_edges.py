@@ -8,16 +8,13 @@ import numpy as np
 
 from rimlight.edge_sampling.rays import lift, lift_beyond
 
+from .beside import BESIDE_LINE, are_edge_on, beside_edge, compare_depth, overhang, passes, rounding
 from .edges import EdgeKind, Edges
 from .grid_edges import GridEdges
 from .meshes import Geometry, bends_light, lets_rays_through
 
 #: Faces whose normals differ by less (sine of the angle) count as coplanar; vertex normals, as equal.
 COPLANAR = 1e-5
-
-#: Faces are seen edge-on, and so face away, if the sine of the angle between them and the line of sight is at most so
-#: large.
-EDGE_ON = 1e-6
 
 #: How far beside the edges of glass to look, in units of the offset of rays that start there, times the cotangent of
 #: the angle between the faces: closer, rays through the mesh start beyond the other face.
@@ -26,11 +23,6 @@ BEHIND = 8
 #: And beside those of meshes that rays go through as if nothing was there, and lines in which such cut others, in units
 #: of the offset of such rays. (At these lines, over the sine of the angle between both.)
 BESIDE_MASK = 2
-
-#: And beside lines in which shapes cut through each other, and inner edges of acute corners, in the same units, where
-#: the other surface overhangs: the cotangent of the angle between both, beyond which rays start below it, but at most
-#: the second number.
-BESIDE_LINE = 1.25, 8
 
 #: And beside sharp edges, in units of `beside_edge`, times the cotangent of the angle between the faces, but at most so
 #: large a cotangent. Closer, rays meet both faces at the same distance, up to rounding, often the one that faces away.
@@ -133,10 +125,6 @@ class DeviceEdges:
         a, b = self.end_points(positions, edge)
         return [dr.cross(b - a, o - a) for o in self.opposite(positions, edge)]
 
-    def _along(self, positions: mi.Float, edge: mi.UInt32) -> mi.Vector3f:
-        a, b = self.end_points(positions, edge)
-        return b - a
-
     def opposite(self, positions: mi.Float, edge: mi.UInt32) -> list[mi.Point3f]:
         """The third vertex of the face on each side, world space."""
         return [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, o, edge)) for o in self._opposite]
@@ -159,6 +147,8 @@ class DeviceEdges:
         that is no silhouette, both faces must be seen, which excludes those at so grazing an angle that a ray has left
         its face, and met what lies beyond the face's other edges. A silhouette must be seen if a ray passes through
         both of its faces, unless one is narrower than the rays are apart. Where more meet, a ray must meet its plane.
+        Where a face is seen edge-on, its other borders are at the same place of the film: a ray must meet a plane of
+        the edge's, and none may meet something before it.
 
         p : a point of the edge that the rays pass, world space. eye, view : see `is_boundary`.
         met : what the rays meet. What lets rays through hides nothing. farther : how much farther they may be from the
@@ -166,7 +156,8 @@ class DeviceEdges:
         """
         a, b = self.end_points(positions, edge)
         normals = [dr.normalize(dr.cross(b - a, o - a)) for o in self.opposite(positions, edge)]
-        covers, shown, reached, crack = [], [], mi.Bool(False), self._crack(positions, edge)
+        covers, shown, crack = [], [], self._crack(positions, edge)
+        reached, before = mi.Bool(False), mi.Bool(False)
         for ray, si in zip(rays, met, strict=True):
             through = self._lets_through(si)
             slack = rounding(p, ray.o) + crack + farther
@@ -174,13 +165,16 @@ class DeviceEdges:
             there = [through | (dr.abs_dot(n, si.p - p) <= slack) for n in normals]
             covers.append(passed[0] & passed[1])
             shown.append((passed[0] & there[0]) | (passed[1] & there[1]))
-            beside = dr.norm(dr.cross(p - ray.o, ray.d))
-            reached |= through | (si.is_valid() & (dr.abs_dot(si.n, si.p - p) <= slack + beside))
+            at_p, nearer = compare_depth(p, ray, si, slack)
+            reached |= through | at_p
+            before |= ~through & nearer
         of = lambda kind: dr.gather(mi.Bool, kind, edge)
         fold = of(self._two_faces) & ~self.is_silhouette(positions, edge, eye, view)
         covered = (covers[0] | covers[1]) & ~(shown[0] | shown[1])
         hidden = dr.select(fold, ~(shown[0] & shown[1]), covered)
         hidden = dr.select(of(self._few_faces), hidden, ~reached)
+        edge_on = [are_edge_on(n, rays[0].d) for n in normals]
+        hidden |= (edge_on[0] | edge_on[1]) & (before | ~reached)
         if self._any_lines:
             hidden = dr.select(of(self._is_line), self._is_hidden_line(positions, edge, p, rays, met), hidden)
         return hidden
@@ -233,14 +227,14 @@ class DeviceEdges:
     ) -> mi.Bool:
         """Does one of the two faces face the eye, and the other not? See `is_boundary`.
 
-        A face that is seen exactly edge-on, up to rounding, faces away, whichever of its edges is asked: so just one
-        of its two borders is a silhouette.
+        A face that is seen exactly edge-on, up to rounding, is between both: each of its borders with a face that is
+        not is a silhouette, and `is_hidden` excludes all of them but the first.
         """
         a, _ = self.end_points(positions, edge)
         towards = -view if view is not None else eye - a
         first, second = self.normals(positions, edge)
-        least = EDGE_ON * dr.norm(towards)
-        return (dr.dot(first, towards) > least * dr.norm(first)) != (-dr.dot(second, towards) > least * dr.norm(second))
+        differ = (dr.dot(first, towards) > 0) == (dr.dot(second, towards) > 0)
+        return differ | (are_edge_on(first, towards) != are_edge_on(second, towards))
 
     def is_fold(self, positions: mi.Float, edge: mi.UInt32, p: mi.Point3f, sight: mi.Vector3f) -> mi.Bool:
         """Do edges have faces on both sides, as seen along a line of sight through a point p of theirs?"""
@@ -285,7 +279,8 @@ class DeviceEdges:
         of = lambda kind: dr.gather(mi.Bool, kind, edge)
         first, second = (dr.normalize(n) for n in self.normals(positions, edge))
         cotangent = dr.dot(first, second) / dr.norm(dr.cross(first, second))
-        inside = dr.dot(dr.cross(first + second, self._along(positions, edge)), to_viewer) > 0
+        a, b = self.end_points(positions, edge)
+        inside = dr.dot(dr.cross(first + second, b - a), to_viewer) > 0
         wedge = dr.select(of(self._glass) & of(self._two_faces), dr.clip(cotangent, 0, 1), 0)
         beyond = dr.select(of(self._mask), mi.Float(BESIDE_MASK), 0)
         if self._any_lines:
@@ -408,43 +403,3 @@ class DeviceEdges:
         if geometry is not None and EdgeKind.SPLIT in self._kinds:
             boundary |= (kind == int(EdgeKind.SPLIT)) & (self.normals_differ(geometry.normals(), edge) > COPLANAR)
         return boundary
-
-
-def overhang(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
-    """How far beside a line in which two surfaces meet rays start below the other one, in units of the offset of rays:
-    see `BESIDE_LINE`. first, second : their normals, on the side of the viewer."""
-    cotangent = -dr.dot(first, second) / dr.norm(dr.cross(first, second))
-    margin, most = BESIDE_LINE
-    return dr.clip(margin * cotangent, 0, most)
-
-
-def line_of_sight(p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]) -> mi.Vector3f:
-    """To a point p, half-way between the rays that pass it: faces may be closer to it than these are."""
-    return p - dr.lerp(rays[0].o, rays[1].o, 0.5)
-
-
-def passes(ray: mi.Ray3f, p: mi.Point3f, corners: list[mi.Point3f]) -> mi.Bool:
-    """Does the line of a ray, which passes close by a point p, pass through a triangle around p?
-
-    Seen from the ray's origin, the corners of a fine triangle are all in one direction, up to rounding.
-    """
-    nearest = dr.fma(ray.d, dr.dot(ray.d, p - ray.o), ray.o)
-    corners = [c - nearest for c in corners]
-    turns = [dr.dot(ray.d, dr.cross(corners[i], corners[i - 1])) for i in range(3)]
-    front = (dr.minimum(*turns[:2]) > 0) & (turns[2] > 0)
-    return front | ((dr.maximum(*turns[:2]) < 0) & (turns[2] < 0))
-
-
-def beside_edge(p: mi.Point3f, q: mi.Point3f) -> mi.Float:
-    """How far beside an edge at p to look, from q or from p: just beyond what single precision can tell apart.
-
-    No farther: on fine meshes, silhouettes hidden by others are closer to these than one would think (the mesh's length
-    of edges times the angle between faces), and their shadows would count twice.
-    """
-    return 0.25 * rounding(p, q)
-
-
-def rounding(p: mi.Point3f, q: mi.Point3f) -> mi.Float:
-    """How far from p or q a point may seem to lie that is computed from both, in single precision."""
-    scale = dr.max(dr.maximum(dr.abs(mi.Vector3f(p)), dr.abs(mi.Vector3f(q))))
-    return 32 * dr.epsilon(mi.Float) * scale

@@ -24,8 +24,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .beside import rounding
 from .boxes import box_of
-from .device_edges import rounding
 from .edges import WHOLE, EdgeKind, Edges, Weld, distinct_rows
 from .grids import is_grid
 from .half_edges import HalfEdges, edge_key

@@ -7,8 +7,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .beside import rounding
 from .boxes import box_of
-from .device_edges import rounding
 from .grids import grids_of
 from .meshes import Geometry, faces, is_met, number_of, vertices
 from .tubes import lines_along

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .device_edges import rounding
+from .beside import rounding
 from .meshes import Geometry, vertices
 
 

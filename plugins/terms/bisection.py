@@ -18,7 +18,8 @@ from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import FilmPart
 from rimlight.edge_sampling.boundaries.shown_shadows import Border
 from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
-from rimlight.edge_sampling.geometry.device_edges import BEHIND, BESIDE_LINE, BESIDE_MASK, overhang, rounding
+from rimlight.edge_sampling.geometry.beside import BESIDE_LINE, overhang, rounding
+from rimlight.edge_sampling.geometry.device_edges import BEHIND, BESIDE_MASK
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
 from rimlight.edge_sampling.parametrisation import Vicinity

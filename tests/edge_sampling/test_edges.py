@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rimlight.edge_sampling import EdgeKind, Geometry, find_edges
-from rimlight.edge_sampling.geometry.device_edges import passes
+from rimlight.edge_sampling.geometry.beside import passes
 
 
 def edges_of(*meshes):

@@ -12,7 +12,8 @@ from building import CUBE_FACES, cube_vertices, diffuse, horizontal, mesh, quad,
 from random_scenes import ball, torus
 
 from rimlight.edge_sampling import Geometry, Intersections, find_welded_edges
-from rimlight.edge_sampling.geometry.device_edges import BESIDE_LINE, DeviceEdges, overhang
+from rimlight.edge_sampling.geometry.beside import BESIDE_LINE, overhang
+from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.rigid_motion import Shapes
 
 
