@@ -115,6 +115,20 @@ def thin_cloth() -> dict:
     return {"type": "mask", "opacity": 0.6, "nested": diffuse(0.7, two_sided=True)}
 
 
+def shiny_leaf() -> mi.Scene:
+    """A leaf of plastic, which is let through in part, and scatters or reflects the rest."""
+    plastic = {"type": "twosided", "nested": {"type": "plastic", "diffuse_reflectance": 0.5}}
+    bsdf = {"type": "mask", "opacity": opacity("nearest", 0.1, 0.9), "nested": plastic}
+    sheet = quad((-1, -0.4, -0.6), (2, 0, 0.5), (0, 1.8, 0.3), "sheet", bsdf=bsdf, uv=[[0, 0], [1, 0], [0, 1], [1, 1]])
+    return scene(
+        sensor=camera((0.6, 1.2, -3.4), (0, 0.4, 0), fov=35),
+        sheet=sheet,
+        cube=mesh("cube", 0.3 * cube_vertices() + [0.1, 0.4, 0.8], CUBE_FACES, bsdf=diffuse(0.6, 0.3, 0.2)),
+        sky=constant(0.4),
+        point=point((-0.6, 3.0, -1.4), 12.0),
+    )
+
+
 def ceiling() -> mi.Mesh:
     return horizontal((-0.6, 3.5, 0.4), 0.4, "lamp", down=True, emitter=light(14, 12, 10))
 
@@ -156,4 +170,5 @@ LEAVES: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
 SEEN_THROUGH: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "coarse_behind_pane": (coarse_ball(lambda: diffuse(0.7), pane=pane), BALL, 2e-3, 3),
     "coarse_veil": (coarse_ball(thin_cloth), BALL, 2e-3, 3),
+    "shiny_leaf": (shiny_leaf, CAMERA, 2e-3, 3),
 }

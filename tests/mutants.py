@@ -337,6 +337,12 @@ MUTANTS = [
         "outline.outward(across, ω)",
     ),
     mutant(
+        "mirrors and textures: which way goes on at a mask of plastic depends on its opacity",
+        "plugins/transport/film_chains.py",
+        "for s in surfaces(tracer.scene) if self._any_mask and is_shiny_mask(s)",
+        "for s in ()",
+    ),
+    mutant(
         "lines of textures: looked at as closely as they are found",
         "plugins/terms/bisection.py",
         "texels = dr.maximum(BESIDE_TEXTURE *",

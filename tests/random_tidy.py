@@ -138,6 +138,9 @@ class TidyGenerator(PatternGenerator):
         return kind
 
     def make_motion(self, scene: mi.Scene, cameras: bool) -> tuple[mi.SceneParameters, Callable[[mi.Float], None]]:
+        # Mitsuba may have made one shape of several.
+        known = mi.traverse(scene)
+        self.movable["thing"] = [m for m in self.movable["thing"] if m[0] in known]
         if not self.movable["thing"]:
             self.movable["thing"] = [m for m in self.movable["camera"] if m[1] in ("pose", "along")]
         return super().make_motion(scene, cameras)

@@ -214,6 +214,10 @@ class Chains:
         #: Mirrors and glass with normal maps or bump maps.
         self._mapped = [mi.BSDFPtr(s.bsdf()) for s in surfaces(tracer.scene) if self.mirrors and is_mapped_mirror(s)]
         self._any_mask = self.mirrors and any(f & mi.BSDFFlags.Null and f & mi.BSDFFlags.Smooth for f in bsdfs)
+        #: Masks whose other part reflects perfectly, too, as one of plastic does.
+        self._shiny_masks = [
+            mi.BSDFPtr(s.bsdf()) for s in surfaces(tracer.scene) if self._any_mask and is_shiny_mask(s)
+        ]
 
     def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:
         """What the camera sees at u."""
@@ -237,15 +241,23 @@ class Chains:
         numbers = Numbers(mi.Point2f(0), mi.sample_tea_float32(choice, vertex.depth), mi.Point2f(0.5))
         goes_on = met & self.tracer.scatters(vertex.depth) & self.mirrors
         bsdf = si.bsdf(ray)
-        mask = self._is_mask(bsdf) & goes_on
-        enters = numbers.lobe < 0.5
-        numbers.lobe = dr.select(mask, dr.select(enters, dr.one_minus_epsilon(mi.Float), 0), numbers.lobe)
+        shiny = self._is_one_of(self._shiny_masks, bsdf) & goes_on
+        mask = (self._is_mask(bsdf) | shiny) & goes_on
+        enters, opaque = numbers.lobe < 0.5, mi.Float(0)
+        if self._shiny_masks:
+            # The mask samples what it covers by numbers below its opacity.
+            opaque = dr.select(shiny, 1 - dr.mean(bsdf.eval_null_transmission(si, shiny)), 0)
+        number = dr.select(enters, dr.one_minus_epsilon(mi.Float), (2 * numbers.lobe - 1) * opaque)
+        numbers.lobe = dr.select(mask, number, numbers.lobe)
         bs, weight = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, goes_on)
         if self._any_mask:
-            let_through = mi.UInt32(int(mi.BSDFFlags.Null))
-            bs.sampled_type = dr.select(mask, dr.select(enters, let_through, 0), bs.sampled_type)
-            bs.wo, bs.eta = dr.select(mask, -si.wi, bs.wo), dr.select(mask, 1, bs.eta)
-            weight = dr.select(mask, 2 * bsdf.eval_null_transmission(si, mask), weight)
+            let_through, mirrored = (mi.UInt32(int(f)) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
+            reflected = dr.select(opaque > 0, bs.sampled_type & mirrored, 0)
+            bs.sampled_type = dr.select(mask, dr.select(enters, let_through, reflected), bs.sampled_type)
+            straight = mask & (enters | ~shiny)
+            bs.wo, bs.eta = dr.select(straight, -si.wi, bs.wo), dr.select(straight, 1, bs.eta)
+            part = dr.select(enters, bsdf.eval_null_transmission(si, mask), opaque * weight)
+            weight = dr.select(mask, 2 * part, weight)
         mirrored, through = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
         goes_on &= mirrored & (mask | dr.any(weight != 0))
         next_ray = spawn_ray(scene, si, si.to_world(bs.wo), through)
@@ -260,7 +272,7 @@ class Chains:
             dr.select(through, RayDerivative(w.at(ray, si), w.d), w.beyond(ray, si, next_ray.d, bs.eta)) for w in ways
         )
         if self._mapped:
-            mapped = self._is_mapped(bsdf) & goes_on & ~through
+            mapped = self._is_one_of(self._mapped, bsdf) & goes_on & ~through
             beyond = tuple(
                 self._beyond_mapped(way, old, vertex, bsdf, numbers, mapped)
                 for way, old in zip(ways, beyond, strict=True)
@@ -280,10 +292,11 @@ class Chains:
         )
         return Link(seen, onwards, beyond, lobe, numbers, self._in_shadow(si, vertex.depth, choice, met))
 
-    def _is_mapped(self, bsdf: mi.BSDFPtr) -> mi.Bool:
+    @staticmethod
+    def _is_one_of(some: list[mi.BSDFPtr], bsdf: mi.BSDFPtr) -> mi.Bool:
         found = mi.Bool(False)
-        for mapped in self._mapped:
-            found |= bsdf == mapped
+        for one in some:
+            found |= bsdf == one
         return found
 
     def _beyond_mapped(self, way, beyond, vertex: Vertex, bsdf, numbers: Numbers, active: mi.Bool) -> RayDerivative:
@@ -415,6 +428,13 @@ class Chains:
 def is_mapped_mirror(shape: mi.Shape) -> bool:
     """Is a shape a perfect mirror or smooth glass with a normal map or a bump map?"""
     return bool(shape.bsdf() and shape.bsdf().flags() & mi.BSDFFlags.Delta and has_normal_map(shape))
+
+
+def is_shiny_mask(shape: mi.Shape) -> bool:
+    """Does an opacity mask cover what scatters light, and reflects or refracts it perfectly besides?"""
+    bsdf = shape.bsdf()
+    smooth, mirrors = mi.BSDFFlags.Smooth, mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
+    return bool(bsdf and bsdf.class_name() == "MaskBSDF" and bsdf.flags() & smooth and bsdf.flags() & mirrors)
 
 
 def _shape_of(pi: mi.PreliminaryIntersection3f) -> mi.UInt32:

@@ -43,6 +43,31 @@ def said(scene, *keys: str, kind: str = "direct_edge", derivative: bool = False,
     return messages
 
 
+# ---------------------- Shapes in the same place ----------------------
+
+
+def twice(kind: str, apart: float):
+    """Two things of a kind, and a sheet whose vertices are in another order."""
+    sheet = ([-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0])
+    place = lambda k: mi.ScalarTransform4f().translate([k * apart, 0, 0])
+    if kind == "mesh":
+        orders = [[0, 1, 2, 3], [2, 0, 3, 1]]
+        of = lambda k: cases.mesh(f"thing_{k}", np.array(sheet)[orders[k]] + [k * apart, 0, 0], [[0, 1, 2], [1, 3, 2]])
+    else:
+        of = lambda k: {"type": kind, "id": f"thing_{k}", "to_world": place(k)}
+    camera = cases.camera((0, 0, -5), (0, 0, 0))
+    return cases.scene(sensor=camera, thing_0=of(0), thing_1=of(1), sky=cases.constant())
+
+
+@pytest.mark.parametrize("kind", ["sphere", "disk", "cylinder", "mesh"])
+@pytest.mark.parametrize("apart", [0, 0.01])
+def test_shapes_in_the_same_place_are_warned_about(kind, apart):
+    key = "thing_0.vertex_positions" if kind == "mesh" else "thing_0.to_world"
+    found = [m for m in said(twice(kind, apart), key) if "in the same place" in m]
+    assert len(found) == (apart == 0)
+    assert all('"thing_0" and "thing_1". Delete' in m for m in found)
+
+
 # ---------------------- Scenes of many shapes ----------------------
 
 
