@@ -31,7 +31,7 @@ from rimlight.edge_sampling.refusals import Refusal
 from rimlight.transport.paths import Depths
 
 from ._coarse_limits import coarse_lamps, coarse_meshes
-from ._copies import copies
+from ._overlaps import copies, fights
 
 #: How much the radius of tubes may grow per length.
 STEEP = 0.05
@@ -119,7 +119,7 @@ def lasting_limits(
         *limits,
         *appearance(scene, depths, moving, lined, bisects=from_points),
         *outlines(scene, geometry, cracks, moving),
-        *(copies(scene) if moving.in_space else ()),
+        *([*copies(scene), *fights(geometry)] if moving.in_space else ()),
     )
 
 

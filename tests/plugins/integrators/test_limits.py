@@ -68,6 +68,16 @@ def test_shapes_in_the_same_place_are_warned_about(kind, apart):
     assert all('"thing_0" and "thing_1". Delete' in m for m in found)
 
 
+@pytest.mark.parametrize("height", [0, 0.01])
+def test_a_sheet_in_the_plane_of_a_floor_is_warned_about(height):
+    floor = cases.horizontal((0, 0, 0), 2, "floor", bsdf=cases.diffuse(0.5))
+    sheet = cases.horizontal((0.5, height, 0.3), 1, "sheet", bsdf=cases.diffuse(0.8))
+    built = cases.scene(sensor=cases.camera((0, 2, -5), (0, 0, 0)), floor=floor, sheet=sheet, sky=cases.constant())
+    found = [m for m in said(built, "sheet.vertex_positions") if "overlap in one plane" in m]
+    assert len(found) == (height == 0)
+    assert all('"floor" and "sheet". Move' in m for m in found)
+
+
 # ---------------------- Scenes of many shapes ----------------------
 
 

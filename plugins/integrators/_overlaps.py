@@ -1,4 +1,4 @@
-"""Shapes that lie exactly in the place of another one: the sentence that says so."""
+"""Shapes that lie in the place of another one, or in one plane with it: the sentences that say so."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight._plan import listed, names
+from rimlight.edge_sampling import Geometry
 from rimlight.edge_sampling.geometry.boxes import box_of
+from rimlight.edge_sampling.geometry.coplanar import coplanar_meshes
 
 
 def copies(scene: mi.Scene) -> list[str]:
@@ -27,6 +29,17 @@ def copies(scene: mi.Scene) -> list[str]:
     return [
         "the derivative is off at the outlines or in the shadows of shapes that lie in the same place: "
         f"{listed(pairs)}. Delete one of both."
+    ]
+
+
+def fights(geometry: Geometry) -> list[str]:
+    """What is off where faces of different materials overlap in one plane."""
+    pairs = [" and ".join(names(pair)) for pair in coplanar_meshes(geometry)]
+    if not pairs:
+        return []
+    return [
+        "which of two surfaces is seen where their faces overlap in one plane is up to rounding, and so is the "
+        f"derivative there: {listed(pairs)}. Move them apart, or cut one of both out."
     ]
 
 
