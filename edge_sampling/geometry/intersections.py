@@ -132,30 +132,34 @@ class Intersections:
         within = np.zeros((self._meshes, 2, 3), np.float32)
         within[list(boxes)] = list(boxes.values())
         within = mi.Float(within.ravel())
-        by_themselves = dr.zeros(mi.UInt32, self._meshes)
-        counts = self._walk(scene, positions, walked, within, by_themselves=by_themselves)
+        counts = self._walk(scene, positions, walked, within)
         ends = dr.cumsum(counts)
-        count, *flags = dr.concat([dr.gather(mi.UInt32, ends, dr.width(ends) - 1), by_themselves]).numpy().tolist()
-        self._by_themselves = {i for i, flag in enumerate(flags) if flag}
+        count = int(dr.gather(mi.UInt32, ends, dr.width(ends) - 1)[0])
         found: list[mi.UInt32] = []
+        self._by_themselves = set()
         if count:
-            cutting = dr.compress(counts > 0)
-            start = dr.gather(mi.UInt32, ends - counts, cutting)
+            reaching = dr.compress(counts > 0)
+            start = dr.gather(mi.UInt32, ends - counts, reaching)
             found = [dr.zeros(mi.UInt32, count) for _ in range(2)]
-            some = _Walked(*(dr.gather(mi.UInt32, n, cutting) for n in (walked.side, walked.mesh)))
+            some = _Walked(*(dr.gather(mi.UInt32, n, reaching) for n in (walked.side, walked.mesh)))
             self._walk(scene, positions, some, within, into=found, start=start)
-            found = self._each_once(found)
-            count = dr.width(found[0])
+            cutting = dr.compress(self._cut(positions, *found))
+            count = dr.width(cutting)
+        if count:
+            found, count = self._each_once([dr.gather(mi.UInt32, f, cutting) for f in found])
         if count > self.capacity:
             self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
-        self._keep(found, count)
+        self._keep(found if count else [], count)
 
-    def _each_once(self, found: list[mi.UInt32]) -> list[mi.UInt32]:
-        """Corners of pairs of triangles, each once, and of repeated triangles once."""
-        corners = self._corner.numpy().reshape(-1, 3)[np.stack([f.numpy() for f in found], 1)]
+    def _each_once(self, found: list[mi.UInt32]) -> tuple[list[mi.UInt32], int]:
+        """Corners of pairs of triangles, each once, and of repeated triangles once; and how many."""
+        pairs = np.stack([f.numpy() for f in found], 1)
+        mesh = np.searchsorted(np.cumsum(self._counts), pairs, side="right")
+        self._by_themselves = set(mesh[mesh[:, 0] == mesh[:, 1], 0].tolist())
+        corners = self._corner.numpy().reshape(-1, 3)[pairs]
         triangle = distinct_rows(np.sort(self._place[corners], axis=2).reshape(-1, 3))[1].reshape(-1, 2)
         first = np.sort(distinct_rows(np.sort(triangle, axis=1))[0])
-        return [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)]
+        return [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)], len(first)
 
     def _keep(self, found: list[mi.UInt32], count: int) -> None:
         """Fill up what is not needed with a vertex, which makes triangles without area."""
@@ -184,17 +188,15 @@ class Intersections:
         *,
         into: list[mi.UInt32] | None = None,
         start: mi.UInt32 | None = None,
-        by_themselves: mi.UInt32 | None = None,
     ) -> mi.UInt32:
-        """Follow each side through all the faces that it goes through; how many pairs of triangles it finds: (S,).
+        """Follow each side through all the faces that it goes through, and that may cut its triangle; how many these
+        are: (S,).
 
         within : for each mesh, the lower and the upper corner of a box outside of which nothing cuts it, (6 M,).
         into, start : where to write the numbers of both triangles, from where on for each side.
-        by_themselves : where to note the meshes that cut through themselves.
         """
-        own = walked.side // 3
-        mine = self._triangle(positions, own)
-        a, b, third = (dr.gather(mi.Point3f, positions, c) for c in self._corners_of(walked.side))
+        own, ends = walked.side // 3, self._corners_of(walked.side)
+        a, b, third = (dr.gather(mi.Point3f, positions, c) for c in ends)
         length = dr.norm(b - a)
         d = (b - a) / length
         step = rounding(a, b)
@@ -224,10 +226,12 @@ class Intersections:
             face = dr.select(is_mesh, dr.gather(mi.UInt32, self._first_face, mesh) + pi.prim_index, 0)
             # Of the edge between two faces, a ray meets one.
             next_to = self._next_to(positions, face, ray(pi.t), step)
+            # Close to a vertex, rays meet the other faces there, and beside a side, that beyond it.
+            near = t + pi.t < 2 * longer, t + pi.t > length - 2 * longer
             for met, new in ((face, is_mesh), (next_to, is_mesh & (next_to != face))):
-                found = new & (met != own) & self._cut(positions, mine, own, met)
-                if by_themselves is not None:
-                    dr.scatter(by_themselves, mi.UInt32(1), mesh, found & (mesh == walked.mesh))
+                corners = self._corners_of(3 * met)
+                has = [(corners[0] == end) | (corners[1] == end) | (corners[2] == end) for end in ends[:2]]
+                found = new & (met != own) & ~((has[0] & near[0]) | (has[1] & near[1]) | (has[0] & has[1]))
                 if into is not None:
                     for target, triangle in zip(into, (own, met), strict=True):
                         dr.scatter(target, triangle, start + count, found)
@@ -257,9 +261,9 @@ class Intersections:
             found = dr.select(near, dr.gather(mi.UInt32, self._beyond, 3 * face + k) // 3, found)
         return found
 
-    def _cut(self, positions: mi.Float, mine: list[mi.Point3f], own: mi.UInt32, met: mi.UInt32) -> mi.Bool:
-        """Do two triangles cut each other? mine : corners of the first."""
-        other = self._triangle(positions, met)
+    def _cut(self, positions: mi.Float, own: mi.UInt32, met: mi.UInt32) -> mi.Bool:
+        """Do two triangles cut each other?"""
+        mine, other = self._triangle(positions, own), self._triangle(positions, met)
         slack = _slack(mine, other)
         cut = common_line(mine, other)[2]
         for face, corners, plane in ((own, mine, other), (met, other, mine)):
