@@ -26,15 +26,16 @@ def coplanar_meshes(geometry: Geometry) -> list[tuple[mi.Mesh, mi.Mesh]]:
         return []
     corners = [vertices(m)[faces(m)].astype(float) for m in meshes]
     size = max(np.abs(c).max() for c in corners)
-    low, high = (np.array([f(c, axis=(0, 1)) for c in corners]) for f in (np.min, np.max))
-    low, high = low - IN_PLANE * size, high + IN_PLANE * size
+    lowest, highest = ([f(c, axis=1) for c in corners] for f in (np.min, np.max))
+    low = np.array([x.min(0) for x in lowest]) - IN_PLANE * size
+    high = np.array([x.max(0) for x in highest]) + IN_PLANE * size
     meet = (low[:, None] <= high).all(2)
     materials = np.array([id(m.bsdf()) for m in meshes])
     candidates = np.argwhere(np.triu(meet & meet.T & (materials[:, None] != materials)))
     found = []
     for i, j in candidates:
         lower, upper = np.maximum(low[i], low[j]), np.minimum(high[i], high[j])
-        near = [c[((c.min(1) <= upper) & (c.max(1) >= lower)).all(1)] for c in (corners[i], corners[j])]
+        near = [corners[k][((lowest[k] <= upper) & (highest[k] >= lower)).all(1)] for k in (i, j)]
         if _overlap(*near, size):
             found.append((meshes[i], meshes[j]))
     return found
