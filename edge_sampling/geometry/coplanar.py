@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from .edges import distinct_rows
 from .grids import is_grid
 from .meshes import Geometry, faces, vertices
 
@@ -46,7 +47,9 @@ def _overlap(first: np.ndarray, second: np.ndarray, size: float) -> bool:
     (first, planes, of), (second, others, of_others) = (_planes(c, size) for c in (first, second))
     if not len(planes) or not len(others):
         return False
-    for k, alike in enumerate(cKDTree(others).query_ball_point(planes, 3 * IN_PLANE)):
+    tree, reach = cKDTree(others), 3 * IN_PLANE
+    shared = np.flatnonzero(np.isfinite(tree.query(planes, distance_upper_bound=reach)[0]))
+    for k, alike in zip(shared, tree.query_ball_point(planes[shared], reach), strict=True):
         axes = np.argsort(np.abs(planes[k, :3]))[:2]
         a = first[of == k][:MOST][..., axes]
         for m in alike:
@@ -63,8 +66,8 @@ def _planes(corners: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, n
     length = np.linalg.norm(n, axis=1)
     corners, n = corners[length > 0], n[length > 0] / length[length > 0, None]
     planes = np.column_stack([n, (n * corners[:, 0]).sum(1) / size])
-    _, first, of = np.unique(np.round(planes / IN_PLANE), axis=0, return_index=True, return_inverse=True)
-    return corners, planes[first], of.ravel()
+    first, of = distinct_rows(np.round(planes / IN_PLANE).astype(np.int64))
+    return corners, planes[first], of
 
 
 def _overlap_flat(a: np.ndarray, b: np.ndarray, slack: float) -> bool:

@@ -227,7 +227,7 @@ def _weld_equal(point: np.ndarray) -> np.ndarray:
 
 
 def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the distinct rows of two or three integers, in any order.
+    """Number the distinct rows of a few integers, in any order.
 
     Returns of each number the first row that has it, (D,), and of each row its number, (N,), int64.
     """

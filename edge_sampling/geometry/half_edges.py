@@ -84,8 +84,8 @@ def edge_key(a: np.ndarray, b: np.ndarray, n: int) -> np.ndarray:
 
 
 def mix(rows: np.ndarray) -> np.ndarray:
-    """Hash the two or three columns of `rows` into one: uint64."""
-    odd = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
+    """Hash the columns of `rows`, four at most, into one: uint64."""
+    odd = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0x27D4EB2F165667C5)
     columns = rows.astype(np.uint64).T
     return np.bitwise_xor.reduce([c * np.uint64(o) for c, o in zip(columns, odd, strict=False)])
 
