@@ -460,8 +460,8 @@ def mirrored_sphere(seam: bool) -> Callable[[], mi.Scene]:
 
 
 def cornell_box() -> mi.Scene:
-    """Mitsuba's own, with the boxes a hundredth higher: the large one sticks in the floor, and lines in which meshes
-    cut each other are not modelled. The meshes share a BSDF, but must not be merged."""
+    """Mitsuba's own, with the boxes a hundredth higher, so that the large one does not stick in the floor. The meshes
+    share a BSDF, but must not be merged."""
     box = mi.cornell_box()
     for name in ("small-box", "large-box"):
         up = mi.ScalarTransform4f().translate([0, 0.01, 0])

@@ -130,8 +130,8 @@ def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
 def _in_front(scene: mi.Scene, light: LightPoint, edge: LitEdge, aside: mi.Vector3f, active: mi.Bool) -> mi.Bool:
     """Of an edge with a face along which light shines: is something else in front of that face, which throws the same
     shadow? Several edges in one plane with the light do, of which the first counts."""
-    edge_on = edge.outline.are_edge_on(edge.d)
-    grazes = edge_on[0] | edge_on[1]
+    first, second = edge.outline.are_lit_along(edge.d)
+    grazes = first | second
     d = dr.select(light.far, -edge.ω, light.y - edge.p)
     along = dr.normalize(d)
     # As far as a ray may go below what is curved and touches the plane: beside it, that is as wide as the root of this.

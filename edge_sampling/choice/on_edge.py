@@ -113,7 +113,7 @@ def is_silhouette(slot: Slot, view: View) -> mi.Bool:
     """Do the faces of an edge lie on either side of the plane through it and the viewer, or is it one from anywhere?"""
     y = mi.Vector4f(view.p.x, view.p.y, view.p.z, -view.w)
     signs = [dr.dot(q, y) for q in slot.planes]
-    edge_on = EDGE_ON * dr.norm(view.w * slot.a - view.p)
+    edge_on = 4 * EDGE_ON * dr.norm(view.w * slot.a - view.p)
     return (signs[0] * signs[1] <= 0) | (dr.abs(signs[0]) <= edge_on) | (dr.abs(signs[1]) <= edge_on)
 
 

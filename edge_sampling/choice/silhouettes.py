@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rimlight.edge_sampling.geometry.beside import are_edge_on, beside_edge
+from rimlight.edge_sampling.geometry.beside import EDGE_ON, are_edge_on, beside_edge
 from rimlight.edge_sampling.geometry.curves import PIECES, Curves
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.grids import grids_of
@@ -66,22 +66,22 @@ class OutlinePoint:
         """Normals of the faces on both sides of an edge: of equal sense, not normalised."""
         return dr.cross(self.tangent, self.inwards[0]), dr.cross(self.inwards[1], self.tangent)
 
-    def are_edge_on(self, d: mi.Vector3f) -> list[mi.Bool]:
-        """Which of its two faces are seen edge-on along d, up to rounding?"""
-        return [are_edge_on(n, d) for n in self.normals]
+    def are_lit_along(self, d: mi.Vector3f) -> list[mi.Bool]:
+        """Along which of its two faces does light shine, in the direction d, up to rounding?"""
+        return [are_edge_on(n, d, 4 * EDGE_ON) for n in self.normals]
 
     def outward(self, across: mi.Vector3f, d: mi.Vector3f, either: bool = False) -> mi.Float:
         """The side of a silhouette on which its faces are not: the sign of `across`, (N,); 0 where they are on both.
 
         across : a direction across the edge and the line of sight. d : along that, from the viewer. either : is an edge
-            with one face that is seen edge-on a silhouette whatever the other one does? Otherwise, such a face faces
+            along one of whose faces light shines a silhouette whatever the other one does? Otherwise, such a face faces
             away.
         """
-        edge_on = self.are_edge_on(d)
-        faces = [(dr.dot(n, d) < 0) & ~on for n, on in zip(self.normals, edge_on, strict=True)]
+        faces = [(dr.dot(n, d) < 0) & ~are_edge_on(n, d) for n in self.normals]
         differ = faces[0] != faces[1]
         if either:
-            differ |= edge_on[0] != edge_on[1]
+            along = self.are_lit_along(d)
+            differ |= along[0] != along[1]
         inwards = [dr.dot(v, across) for v in self.inwards]
         inwards = dr.select(dr.abs(inwards[0]) > dr.abs(inwards[1]), inwards[0], inwards[1])
         outward = dr.select(differ, -dr.sign(inwards), 0)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 #: Faces are seen edge-on if the sine of the angle between them and the line of sight is at most so large.
-EDGE_ON = 4e-6
+EDGE_ON = 1e-6
 
 #: How far to look beside lines in which shapes cut through each other, and beside inner edges of acute corners, where
 #: the other surface overhangs, in units of the offset of rays that start there: the cotangent of the angle between
@@ -14,9 +14,9 @@ EDGE_ON = 4e-6
 BESIDE_LINE = 1.25, 8
 
 
-def are_edge_on(n: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
-    """Are faces with normals n seen along d edge-on, up to rounding?"""
-    return dr.abs_dot(n, d) <= EDGE_ON * dr.norm(n) * dr.norm(d)
+def are_edge_on(n: mi.Vector3f, d: mi.Vector3f, least: float = EDGE_ON) -> mi.Bool:
+    """Are faces with normals n seen along d edge-on, up to rounding? least : sine of the angle from which on not."""
+    return dr.abs_dot(n, d) <= least * dr.norm(n) * dr.norm(d)
 
 
 def compare_depth(
