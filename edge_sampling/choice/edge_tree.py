@@ -237,7 +237,7 @@ class EdgeTree:
         used = length > 0
         widest = lambda f, empty: [dr.select(used, f(x, y), empty) for x, y in zip(s.a, s.b, strict=True)]
         # Twice as wide as what the test of a single edge lets pass.
-        slack = 2 * 4 * EDGE_ON * mi.Vector4f(1, 1, 1, dr.norm(s.a) + dr.norm(s.b))
+        slack = 8 * EDGE_ON * mi.Vector4f(1, 1, 1, dr.norm(s.a) + dr.norm(s.b))
         return Node(
             length * (1 - s.always),
             length * s.always,
