@@ -31,7 +31,8 @@ def coplanar_meshes(geometry: Geometry) -> list[tuple[mi.Mesh, mi.Mesh]]:
     low = np.array([x.min(0) for x in lowest]) - IN_PLANE * size
     high = np.array([x.max(0) for x in highest]) + IN_PLANE * size
     meet = (low[:, None] <= high).all(2)
-    materials = np.array([id(m.bsdf()) for m in meshes])
+    bsdfs = [m.bsdf() for m in meshes]  # held, so that none has the number of another one
+    materials = np.array([id(b) for b in bsdfs])
     candidates = np.argwhere(np.triu(meet & meet.T & (materials[:, None] != materials)))
     found = []
     for i, j in candidates:

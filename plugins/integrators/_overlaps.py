@@ -44,7 +44,8 @@ def fights(geometry: Geometry) -> list[str]:
 
 
 def _place(shape: mi.Shape) -> np.ndarray:
-    """Its vertices, in an order that depends on where they are alone, or its transformation."""
+    """Its vertices, in an order that depends on where they are alone, or its transformation. NaN, which equals nothing,
+    where it has neither."""
     params = mi.traverse(shape)
     if "vertex_positions" in params:
         return np.array(sorted(map(tuple, np.array(params["vertex_positions"]).reshape(-1, 3))))
