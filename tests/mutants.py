@@ -528,6 +528,12 @@ MUTANTS = [
         "            if False:\n                slack",
     ),
     mutant(
+        "film boundary: edges count where a veil before them ends as well",
+        "edge_sampling/boundaries/film_boundary.py",
+        "active &= passed[0] == passed[1]",
+        "active &= True",
+    ),
+    mutant(
         "film boundary: lines of textures count below what stands on them",
         "edge_sampling/boundaries/film_boundary.py",
         "hidden |= (bent > 0) & ~one",

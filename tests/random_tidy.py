@@ -40,8 +40,9 @@ class TidyGenerator(PatternGenerator):
     def make_sensor(self) -> None:
         super().make_sensor()
         sensor = self.objects["sensor"]
-        if sensor["type"] == "perspective" and self.chance(0.4):
-            # In front of all, on the axis
+        #: Is the camera in front of all, on the axis?
+        self.on_axis = sensor["type"] == "perspective" and self.chance(0.4)
+        if self.on_axis:
             sensor["to_world"] = self.look([0, self.pick(0.85, 1.35), 4.6], [0, self.pick(0.35, 0.85), 0])
             self.labels[-1] += "/along"
         #: Is it a front view, or a plan, in which faces are seen edge-on?
@@ -87,6 +88,8 @@ class TidyGenerator(PatternGenerator):
         linear = turned @ np.diag([width, height, 1])
         self.objects["wall"] = self.mesh("wall", quad(), linear, [x, FLOOR + height - below, z], bsdf)
         self.labels.append(f"{where}:{kind}{'/cut' if below else ''}")
+        if where == "across" and self.on_axis:
+            self.movable["camera"] = [("sensor.to_world", "across", np.zeros(3))]  # does not leave the wall's plane
         if kind in ("conductor", "thindielectric") and not self.still:
             self.movable["thing"].append(("wall.vertex_positions", "along" if turned[0, 0] else "across", np.zeros(3)))
 
@@ -142,7 +145,7 @@ class TidyGenerator(PatternGenerator):
         known = mi.traverse(scene)
         self.movable["thing"] = [m for m in self.movable["thing"] if m[0] in known]
         if not self.movable["thing"]:
-            self.movable["thing"] = [m for m in self.movable["camera"] if m[1] in ("pose", "along")]
+            self.movable["thing"] = [m for m in self.movable["camera"] if m[1] in ("pose", "along", "across")]
         return super().make_motion(scene, cameras)
 
     def mover(self, params, key: str, how: str, centre) -> Callable[[mi.Float], None]:

@@ -151,6 +151,14 @@ def plan() -> mi.Scene:
     return scene(sensor=at, floor=floor(), **things, sun=sun(0.3, -1, 0.5), sky=constant(0.1))
 
 
+def glass_plan() -> mi.Scene:
+    """A box of thin glass in the air, seen from above: the outlines of its top and of its bottom are at one place."""
+    at = elevation((0.037, 4, 0.013), (0.037, 0, 0.013), (0, 0, 1))
+    to_world = mi.ScalarTransform4f().translate([0, 0.5, 0]).scale([0.5, 0.3, 0.4])
+    glass = {"type": "cube", "to_world": to_world, "bsdf": {"type": "thindielectric"}}
+    return scene(sensor=at, floor=floor(), box=glass, sun=sun(0.3, -1, 0.5), sky=constant(0.1))
+
+
 def inside_out() -> mi.Scene:
     """A box and a bent sheet whose normals point inwards, in a sun that shines along their sides."""
     points, _, _, faces = box((-0.3, 0.2, -0.5), (0.5, 0.8, 0.5))
@@ -175,5 +183,6 @@ TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
     "books": (books, CAMERA, 2e-3),
     "front_view": (front_view, {**CAMERA, "direction": [1, 0.3, 0]}, 2e-3),
     "plan": (plan, {**CAMERA, "direction": [1, 0, 0.4]}, 2e-3),
+    "glass_plan": (glass_plan, {**CAMERA, "direction": [1, 0, 0.4]}, 2e-3),
     "inside_out": (inside_out, CAMERA, 2e-3),
 }

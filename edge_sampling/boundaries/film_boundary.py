@@ -225,7 +225,9 @@ class FilmBoundary:
                 slack = BENT * around / at.projection.pixels_per_unit(at.projection.film(p))
                 before = Before(p, rounding(p, rays[0].o) + slack, mi.Bool(True))
                 go_on = lambda ray, pi: behind_veils(scene, ray, pi, before.veils, active)
-                sides = zip(*map(go_on, rays, met), strict=True)
+                *sides, passed = zip(*map(go_on, rays, met), strict=True)
+                # Where only one ray goes through a veil, that ends here, too, and its outline has the whole jump.
+                active &= passed[0] == passed[1]
             sides = [list(of) for of in sides]
             active &= self._jumps_between(scene, at, chosen, found, p, n, *sides)
             horizons = self._sides_of_horizons(at, chosen, found, p, *sides)
@@ -250,7 +252,7 @@ class FilmBoundary:
         if self.veils:
             no_grid = lambda si, ray: reduce(operator.and_, [si.shape != mi.ShapePtr(g.inner) for g in grids], True)
             grids = self.outlines.grids
-            ray, pi = behind_veils(scene, ray, pi, no_grid, active)
+            ray, pi, _ = behind_veils(scene, ray, pi, no_grid, active)
         return pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
 
     def _shared_directions(

@@ -26,18 +26,22 @@ def behind_veils(
     pi: mi.PreliminaryIntersection3f,
     passed: Callable[[mi.SurfaceInteraction3f, mi.Ray3f], mi.Bool],
     active: mi.Bool,
-) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
-    """The rays behind veils, and what they meet. pi : what they meet first. passed : which veils. Detached."""
+) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.UInt32]:
+    """The rays behind veils, what they meet, and how many veils they went through. Detached.
 
-    def go_on(ray, pi, active):
+    pi : what they meet first. passed : which veils.
+    """
+
+    def go_on(ray, pi, count, active):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         through = active & is_veil(si) & passed(si, ray)
         ray = dr.select(through, mi.Ray3f(spawn_ray(scene, si, ray.d, True)), ray)
         beyond = scene.ray_intersect_preliminary(ray, active=through)
-        return ray, dr.select(through, beyond, pi), through & beyond.is_valid()
+        return ray, dr.select(through, beyond, pi), count + dr.select(through, 1, 0), through & beyond.is_valid()
 
-    state = (mi.Ray3f(ray), mi.PreliminaryIntersection3f(pi), active & pi.is_valid())
-    return dr.while_loop(state, lambda *state: state[-1], go_on, label="behind veils")[:2]
+    none = dr.zeros(mi.UInt32, dr.width(pi.t))
+    state = (mi.Ray3f(ray), mi.PreliminaryIntersection3f(pi), none, active & pi.is_valid())
+    return dr.while_loop(state, lambda *state: state[-1], go_on, label="behind veils")[:3]
 
 
 @dataclass
