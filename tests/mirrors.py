@@ -48,6 +48,24 @@ def pane() -> mi.Scene:
     return scene(sensor=at, cube=cube(), pane=plate, floor=floor, sky=constant(0.5))
 
 
+def mirror_throws() -> mi.Scene:
+    """A floor that gets light of a lamp by way of a mirror, and a black cube between both: only the floor is seen."""
+    wall = quad((-1.2, -0.1, 1), (0, 2, 0), (2.4, 0, 0), "mirror", bsdf={"type": "conductor"})
+    shine = quad((-1, 0.2, -2.2), (2, 0, 0), (0, 1.4, 0), "lamp", bsdf=diffuse(0.0), emitter=light(6, 5, 4))
+    floor = horizontal((0, -0.2, 0), 2, "floor", bsdf=diffuse(0.6, two_sided=True))
+    at = camera((0.15, 2.4, 0.2), (0, 0, 0.1), fov=30)
+    return scene(sensor=at, floor=floor, cube=cube((0.2, 0.9, -0.9), 0.35, bsdf=diffuse(0.0)), mirror=wall, lamp=shine)
+
+
+def glass_throws() -> mi.Scene:
+    """A floor below a ball of glass, behind which is a black cube: only the floor is seen."""
+    ball = {"type": "sphere", "center": [0, 0.4, 0.2], "radius": 0.45, "bsdf": {"type": "dielectric"}}
+    floor = horizontal((0, -0.2, 0), 2, "floor", bsdf=diffuse(0.6, two_sided=True))
+    at = camera((0.15, 1.1, -1.9), (0, -0.3, -0.55), fov=25)
+    dark = cube((0.2, 0.6, 1.0), 0.4, bsdf=diffuse(0.0))
+    return scene(sensor=at, floor=floor, cube=dark, ball=ball, sky=constant(0.5))
+
+
 def glass_tetrahedron() -> mi.Scene:
     """A tetrahedron of glass under a sky, whose faces meet at less than a right angle."""
     vertices, _, _, faces = tetrahedron()
@@ -426,6 +444,8 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "glass_in_floor": (glass_in_floor, CAMERA, 2e-3, 4),
     "glass_ball_in_floor": (glass_ball_in_floor, CAMERA, 2e-3, 4),
     "pane": (pane, SLIDE, 2e-3, 5),
+    "mirror_throws": (mirror_throws, SLIDE, 4e-3, 3),
+    "glass_throws": (glass_throws, SLIDE, 4e-3, 4),
     "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),
     "glass_ball_camera": (glass_ball, CAMERA, 1e-3, 6),

@@ -259,6 +259,24 @@ MUTANTS = [
         "pass",
     ),
     mutant(
+        "mirrors from points: the chain moves as if the point that sees it stood still",
+        "plugins/terms/mirrored.py",
+        "        since = dr.select(slides, mi.UInt32(1), 2)",
+        "        since = mi.UInt32(9)",
+    ),
+    mutant(
+        "mirrors from points: edges count that no mirror shows",
+        "plugins/transport/chain_rays.py",
+        "    sees_all = False",
+        "    sees_all = True",
+    ),
+    mutant(
+        "mirrors from points: they are not looked for",
+        "plugins/integrators/_search.py",
+        "mirrored = bool(chains[0] and sppi",
+        "mirrored = bool(chains[0] and 0",
+    ),
+    mutant(
         "mirrors and textures: seams of texture coordinates count twice",
         "plugins/transport/film_chains.py",
         "gap |= dr.norm(self.uv - other.uv) > near * per_unit + rounding",

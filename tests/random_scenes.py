@@ -204,10 +204,11 @@ class Generator:
             self.scale, self.origin = 1.0, np.zeros(3)
         # What moves must not show instances, whose outlines were unknown: no sky, no gloss, no interreflections.
         self.instances = self.chance(0.06) and self.special not in ("jumps", "beams", "instances", *SHOWN)
-        # The light that mirrors throw on other surfaces is missing: where they are followed, all else only glows.
-        self.glows = self.special == "jumps" and self.chance(0.5)
+        # In half of the scenes in which mirrors are followed, all else only glows: then little hides what they show.
+        followed = self.special == "jumps" and self.chance(0.5)
+        self.glows = followed and self.chance(0.5)
         direct = self.chance(0.6) or self.instances
-        direct = {"jumps": not self.glows, "textures": True, "beams": False, "mirrors": False}.get(self.special, direct)
+        direct = {"jumps": not followed, "textures": True, "beams": False, "mirrors": False}.get(self.special, direct)
         self.depth = depth = 2 if direct else self.longest()
         integrator = {"type": "direct_edge"} if direct else {"type": "prb_edge", "max_depth": depth, "rr_depth": 100}
         self.labels.insert(0, "direct_edge" if direct else f"prb_edge/{depth}")
@@ -224,10 +225,8 @@ class Generator:
         for i in range(self.rng.integers(1, 3)):
             kinds.append(self.make_light(i, kinds))
         if self.special in ("jumps", "patterns", "tidy") and not {"sky", "environment"} & set(kinds):
-            # Without one, `path` drops light that comes through a mask or a thin glass; and mirrors show little. (But
-            # what these throw on other surfaces of a sky that shines is missing.)
-            radiance = 0.2 if direct or self.special == "jumps" else 0.0
-            self.objects["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
+            # Without one, `path` drops light that comes through a mask or a thin glass; and mirrors show little.
+            self.objects["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}}
         scene = mi.load_dict(self.objects)
         params, move = self.make_motion(scene, cameras=not self.instances)
         return RandomScene(scene, params, move, integrator, depth, " ".join(self.labels))

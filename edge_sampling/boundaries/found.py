@@ -34,7 +34,8 @@ class Boundaries:
     `lights` : chooses one, where there are many. `lamps` : how their light is divided.
     `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from surfaces.
     `horizons` : where interpolated normals turn away from points. `held` : shapes whose points are held where the
-    camera sees them. `lamp_planes` : of coarse lamps with interpolated normals."""
+    camera sees them. `lamp_planes` : of coarse lamps with interpolated normals. `mirrored` : may other points, too, see
+    edges in perfect mirrors, or through glass?"""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -57,6 +58,7 @@ class Boundaries:
     horizons: HorizonsAtPoints | None = None
     held: HeldShapes | None = None
     lamp_planes: LampPlanes | None = None
+    mirrored: bool = False
 
     @property
     def silhouettes(self) -> Silhouettes | None:

@@ -105,13 +105,14 @@ def lasting_limits(
     *,
     planes: bool,
     from_points: bool,
+    from_surfaces: bool,
 ) -> tuple[str, ...]:
     """What the derivative will lack as long as the edges stay what they are. lined : see `appearance`. planes,
-    from_points : see `BoundarySearch`."""
+    from_points, from_surfaces : see `BoundarySearch`."""
     limits = []
     if sppi:
-        limits += reflected_light(scene, geometry, depths, from_points=from_points)
-        limits += shut_in_lamps(scene, moving) if depths.scatters(2) else []
+        limits += reflected_light(scene, geometry, depths, from_points=from_points, from_surfaces=from_surfaces)
+        limits += shut_in_lamps(scene, moving) if depths.scatters(2) and from_surfaces else []
         if depths.scatters(1):
             limits += coarse_lamps(scene, depths, planes=planes) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
@@ -123,7 +124,9 @@ def lasting_limits(
     )
 
 
-def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool) -> list[str]:
+def reflected_light(
+    scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool, from_surfaces: bool
+) -> list[str]:
     """What lacks of the light that surfaces reflect."""
     limits = []
     if not from_points and (depths.scatters(2) or scene.environment() is not None):
@@ -137,7 +140,8 @@ def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from
             f"the derivative lacks the border of the beams of {listed(beams)}: give a spot a beam_width below its "
             "cutoff_angle, and a projector an image with a black border."
         )
-    if any(is_mirror(s) for s in surfaces(scene)) and (depths.scatters(2) or not from_points):
+    sought = from_points and (not depths.scatters(2) or not from_surfaces)
+    if not sought and any(is_mirror(s) for s in surfaces(scene)):
         lacks = "outlines in the light that perfect mirrors and glass throw on other surfaces"
         lacks = lacks if from_points else "what perfect mirrors and glass show"
         limits.append(

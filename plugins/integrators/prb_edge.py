@@ -60,10 +60,11 @@ class PRBEdgeIntegrator(EdgeIntegrator):
 
     **Memory.** As with ``direct_edge``, many samples are taken in passes.
 
-    **Limits.** Those of ``direct_edge``, but for interreflections. Missing, with a warning, are outlines in the light
-    that perfect mirrors and glass throw on other surfaces, and textures that jump on spheres, disks and cylinders, in
-    the light that these throw on surfaces close to them. With ``max_depth`` above 32 or -1, the vertices of paths are
-    counted before they are written down, which ``dr.freeze`` cannot record in a derivative.
+    **Limits.** Those of ``direct_edge``, but for interreflections. Outlines in the light that perfect mirrors and glass
+    throw on other surfaces are there, but noisy: they are sought in random directions. Missing, with a warning, are
+    textures that jump on spheres, disks and cylinders, in the light that these throw on surfaces close to them. With
+    ``max_depth`` above 32 or -1, the vertices of paths are counted before they are written down, which ``dr.freeze``
+    cannot record in a derivative.
 
     .. tabs::
         .. code-tab:: xml

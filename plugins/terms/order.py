@@ -8,6 +8,7 @@ from .film import FilmTerm
 from .horizons import HorizonsTerm
 from .indirect import IndirectShadowsTerm
 from .interior import InteriorTerm
+from .mirrored import MirroredTerm
 from .passing import PassingTerm
 from .points import PointsTerm
 from .shadows import ShadowsTerm
@@ -24,4 +25,5 @@ TERMS: tuple[Term, ...] = (
     IndirectShadowsTerm(),
     FacePlanesTerm(),
     HorizonsTerm(),
+    MirroredTerm(),
 )

@@ -11,7 +11,7 @@ import mitsuba as mi
 from rimlight._plan import PlannedTerm
 from rimlight.edge_sampling import Projection
 from rimlight.edge_sampling.projection.sensors import frame
-from rimlight.transport.film_chains import FilmRays
+from rimlight.transport.chain_rays import FilmRays
 
 from .sampling import in_a_row, seed_of, size
 from .term import FilmSamples, Job, Sample, Term

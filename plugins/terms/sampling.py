@@ -16,6 +16,7 @@ SALT |= {"planes of faces": 0x33333333, "shadows in indirect light": 0x99999999}
 SALT |= {"mirrors and textures": 0x66666666, "horizons from points": 0x22222222}
 SALT |= {"shadows in light from surfaces": 0x88888888, "shadows in indirect light, continued": 0x77777777}
 SALT |= {"light paths": 0xCCCCCCCC, "paths": 0xBBBBBBBB, "passing surfaces": 0xDDDDDDDD, "planes of lamps": 0xEEEEEEEE}
+SALT |= {"mirrors from points": 0x44444444}
 
 #: Samples of the film boundary at one sample per pixel: at most so many times width plus height of the film.
 LINE = 16

@@ -17,11 +17,12 @@ from rimlight.edge_sampling.geometry.meshes import has_normal_map, surfaces
 from rimlight.edge_sampling.geometry.surfaces import components
 from rimlight.edge_sampling.rays import spawn_ray, starts_in
 
+from .chain_rays import FilmRays, PointRays
 from .log import Log
 from .paths import Vertex
 from .ray_derivatives import RayDerivative, change_of, normal_derivative
 from .scattering import Next, Numbers
-from .tracer import PathTracer, camera_vertex
+from .tracer import PathTracer
 
 #: Two points close to each other on the film show one surface, if they are at most so many times as far apart as the
 #: one of them that moves less has it; and their normals likewise.
@@ -30,36 +31,6 @@ APART = 3.0
 #: What rounding may add to the distance of two points, in units in the last place of their coordinates; and to the
 #: difference of two normals.
 ROUNDING, BENT = 256, 1e-3
-
-#: Part of a pixel by which film positions differ of which derivatives along the film are made.
-STEP = 0.25
-
-
-class FilmRays:
-    """Camera rays at positions of a film, all with the same random numbers.
-
-    sensor : no `batch`. sampler : for these numbers, if there are any.
-    """
-
-    def __init__(self, sensor: mi.Sensor, sampler: mi.Sampler):
-        film = sensor.film()
-        self.sensor = sensor
-        self.offset, self.size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
-        self.time = mi.Float(sensor.shutter_open())
-        if sensor.shutter_open_time() > 0:
-            self.time += sampler.next_1d() * sensor.shutter_open_time()
-        self.wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-        self.lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-
-    def at(self, u: mi.Point2f, active: mi.Bool | bool = True) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """Rays and their weights. u : mi.Point2f, pixels."""
-        on_film = (u - self.offset) / self.size
-        return self.sensor.sample_ray_differential(self.time, self.wavelength, on_film, self.lens, active)
-
-    def derivative(self, u: mi.Point2f, axis: mi.Vector2f) -> RayDerivative:
-        """Along a unit vector of the film."""
-        (a, _), (b, _) = (self.at(u + sign * STEP * axis) for sign in (-1, 1))
-        return RayDerivative(mi.Vector3f(b.o - a.o) / (2 * STEP), mi.Vector3f(b.d - a.d) / (2 * STEP))
 
 
 @dataclass
@@ -207,7 +178,7 @@ class Chains:
     boundaries : with what is known of mirrors, of textures whose lines count, and of surfaces.
     """
 
-    def __init__(self, tracer: PathTracer, rays: FilmRays, boundaries: Boundaries):
+    def __init__(self, tracer: PathTracer, rays: FilmRays | PointRays, boundaries: Boundaries):
         self.tracer, self.rays, self.surfaces = tracer, rays, boundaries.surfaces
         self.mirrors, self.textures, self.shown = boundaries.mirrors, boundaries.textures, boundaries.shown
         bsdfs = [s.bsdf().flags() for s in surfaces(tracer.scene) if s.bsdf() is not None]
@@ -220,9 +191,8 @@ class Chains:
         ]
 
     def first(self, u: mi.Point2f, active: mi.Bool) -> Vertex:
-        """What the camera sees at u."""
-        ray = mi.Ray3f(self.rays.at(u, active)[0])
-        return camera_vertex(ray, self.tracer.first_hit(ray, active))
+        """What is seen at u."""
+        return self.rays.first(self.tracer, u, active)
 
     def link(
         self, vertex: Vertex, ways: tuple[RayDerivative, ...], choice: mi.UInt32, shown: mi.Bool, active: mi.Bool
@@ -239,7 +209,7 @@ class Chains:
         if self.tracer.fine_mirrors is not None:
             self.tracer.fine_mirrors.turn(si, ray, met)
         numbers = Numbers(mi.Point2f(0), mi.sample_tea_float32(choice, vertex.depth), mi.Point2f(0.5))
-        goes_on = met & self.tracer.scatters(vertex.depth) & self.mirrors
+        goes_on = met & self._scatters(vertex) & self.mirrors
         bsdf = si.bsdf(ray)
         shiny = self._is_one_of(self._shiny_masks, bsdf) & goes_on
         mask = (self._is_mask(bsdf) | shiny) & goes_on
@@ -290,7 +260,7 @@ class Chains:
             dr.select(textured, dr.norm(mi.Vector2f(*components(at, si.dp_du, si.dp_dv))), 0),
             mi.Bool(False),
         )
-        return Link(seen, onwards, beyond, lobe, numbers, self._in_shadow(si, vertex.depth, choice, met))
+        return Link(seen, onwards, beyond, lobe, numbers, self._in_shadow(si, vertex, choice, met))
 
     @staticmethod
     def _is_one_of(some: list[mi.BSDFPtr], bsdf: mi.BSDFPtr) -> mi.Bool:
@@ -309,11 +279,14 @@ class Chains:
         d = change_of(self.tracer.scene, direction, vertex.ray, vertex.pi, way, active)
         return RayDerivative(beyond.o, dr.select(active, d, beyond.d))
 
-    def _in_shadow(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, choice: mi.UInt32, active: mi.Bool) -> mi.Bool:
+    def _scatters(self, vertex: Vertex) -> mi.Bool:
+        return self.tracer.scatters(vertex.depth + self.rays.before)
+
+    def _in_shadow(self, si: mi.SurfaceInteraction3f, vertex: Vertex, choice: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Is a point in the shadow of a light? (Shadows on what the camera sees itself are found from the light.)"""
         if self.shown is None:
             return mi.Bool(False)
-        active = active & (depth > 1) & self.tracer.scatters(depth)
+        active = active & (vertex.depth > 1) & self._scatters(vertex)
         active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         return active & self.shown.hidden(self.tracer.scene, si, choice, active)
 
@@ -343,6 +316,7 @@ class Chains:
             found = link.seen
             found.way = mi.sample_tea_32(seen.way, (found.way << 3) + link.lobe)[0]
             found.cells = mi.sample_tea_32(seen.cells, dr.select(link.dark, ~found.cells, found.cells))[0]
+            found.cells = dr.select(seen.shown | self.rays.sees_all, found.cells, seen.cells)
             found.shown = mi.Bool(seen.shown)
             goes_on = active & (link.lobe > 0)
             found = dr.select(active, found, seen)
@@ -389,7 +363,7 @@ class Chains:
                 differ &= same_face | shown | ~self.textures.jump_at_edges(a.ray, a.pi, active)
             # So it does where a shadow begins at an edge, since one of both faces turns away from the light.
             dark = (here.dark != there.dark) & (same_face | shown)
-            on_line = active & ~parts & ~grazes & (differ | dark)
+            on_line = active & ~parts & ~grazes & (differ | dark) & (shown | self.rays.sees_all)
             on_texture |= on_line & differ
             on_shadow |= on_line & ~differ
             found |= (active & (parts | grazes) & shown & ~self._starts_beyond(a, b)) | on_line

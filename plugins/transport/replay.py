@@ -228,6 +228,7 @@ class MovingVertex:
     onwards : is the direction to the vertex beyond wanted, too? It is `d`, with gradients of its own.
     lamps : see `Chain`. With the lobes of the vertices, directions are `turning`, with gradients of their own.
     before : as `since`, of the vertex before, which looks at this one. Only needed with `lamps`.
+    at_first : the surface at the first vertex, as it moves, if `ray` is none of the camera's; the log begins behind it.
     """
 
     def __init__(
@@ -244,13 +245,14 @@ class MovingVertex:
         onwards: bool = False,
         lamps: DividedLight | None = None,
         before: mi.UInt32 | None = None,
+        at_first: mi.SurfaceInteraction3f | None = None,
     ):
         self.chain, self.first, self.log, self.vicinity = chain, first, log, chain.vicinity
         self.vertex, self.active, self.since = vertex, active, since
         self.depth = mi.UInt32(vertex.depth)
         #: Up to which vertex there is a ray to it.
         self._last = self.depth + 1 if onwards else self.depth
-        self._start(ray)
+        self._start(ray, at_first)
         at_first = self.depth == 1
         with dr.suspend_grad():
             other = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
@@ -275,14 +277,16 @@ class MovingVertex:
                 for leaf, δ, later in zip(self.leaves, (δp, δn, δd, δaxis), self._forward(δo, δd), strict=True):
                     dr.set_grad(leaf, dr.select(at_first, mi.Vector3f(δ), later))
 
-    def _start(self, ray: mi.Ray3f) -> None:
+    def _start(self, ray: mi.Ray3f, si: mi.SurfaceInteraction3f | None) -> None:
         """The first vertex, and what moves the second."""
-        scene, pi = self.chain.scattering.scene, self.first.pi
-        si = self.at_first = seen_by_camera(scene, ray, pi, self.active, attached=True, held=self.chain.held)
+        scene, pi, known = self.chain.scattering.scene, self.first.pi, si is not None
+        if not known:
+            si = seen_by_camera(scene, ray, pi, self.active, attached=True, held=self.chain.held)
+        self.at_first = si
         active = self.active & (self._last > 1)
         second = self.log.vertex(dr.full(mi.UInt32, 2, dr.width(self.depth)), active)
         d = second.ray.d
-        if self.chain.scattering.any_mirror:
+        if self.chain.scattering.any_mirror and not known:
             with dr.resume_grad():
                 numbers = self.log.numbers(self.first.depth, active)
                 d = self.chain.turned(si, si.bsdf(ray), second, numbers, active)

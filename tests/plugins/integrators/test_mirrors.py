@@ -43,6 +43,14 @@ def test_frozen_functions(name, make):
     assert_frozen_is_unfrozen(make(), mi.load_dict(INTEGRATORS[name]), "cube.vertex_positions")
 
 
+@pytest.mark.parametrize("key", ["cube.vertex_positions", "mirror.vertex_positions", "sensor.to_world"])
+def test_what_mirrors_throw_on_other_surfaces(key):
+    """In both modes, and frozen."""
+    scene, made = mirrors.mirror_throws(), mi.load_dict(INTEGRATORS["prb_edge"])
+    assert_backward_is_forward(scene, made, Motion(scene, key, direction=[1, 0.4, 0.2]))
+    assert_frozen_is_unfrozen(scene, made, key)
+
+
 @pytest.mark.parametrize("key", ["ball.vertex_positions", "ball.bsdf.normalmap.data"])
 def test_frozen_functions_with_normal_maps(key):
     assert_frozen_is_unfrozen(mirrors.mapped_ball(), mi.load_dict(INTEGRATORS["direct_edge"]), key)
