@@ -362,7 +362,7 @@ MUTANTS = [
     ),
     mutant(
         "lines of textures: looked at as closely as they are found",
-        "plugins/terms/bisection.py",
+        "plugins/terms/jumps.py",
         "texels = dr.maximum(BESIDE_TEXTURE *",
         "texels = dr.maximum(0 * BESIDE_TEXTURE *",
     ),

@@ -243,15 +243,6 @@ def test_unknown_parameters_are_refused():
         mi.load_dict({"type": "prb_edge", "max_dept": 3})
 
 
-def test_mirrors_are_warned_about_once():
-    scene = cases.room(lambda: cases.camera(film=small()), bsdf=lambda: {"type": "conductor"})()
-    motion, it = Motion(scene, **SIDE), integrator(sppc=0, sppp=0)
-    with cases.messages() as found:
-        for _ in range(2):
-            derivative_image(scene, it, motion, spp=1)
-    assert sum("prb_edge: the derivative lacks" in m and "perfect mirrors" in m for m in found) == 1
-
-
 # ---------------------- Other variants ----------------------
 
 
