@@ -445,6 +445,7 @@ MIRRORS: dict[str, tuple[Callable[[], mi.Scene], dict, float, int]] = {
     "glass_ball_in_floor": (glass_ball_in_floor, CAMERA, 2e-3, 4),
     "pane": (pane, SLIDE, 2e-3, 5),
     "mirror_throws": (mirror_throws, SLIDE, 4e-3, 3),
+    "mirror_throws_camera": (mirror_throws, CAMERA, 4e-3, 3),
     "glass_throws": (glass_throws, SLIDE, 4e-3, 4),
     "glass_tetrahedron": (glass_tetrahedron, TETRAHEDRON, 2e-3, 2),
     "glass_ball": (glass_ball, BALL, 1e-3, 6),

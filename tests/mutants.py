@@ -261,14 +261,14 @@ MUTANTS = [
     mutant(
         "mirrors from points: the chain moves as if the point that sees it stood still",
         "plugins/terms/mirrored.py",
-        "        since = dr.select(slides, mi.UInt32(1), 2)",
-        "        since = mi.UInt32(9)",
+        "        since = mi.UInt32(1)",
+        "        since = mi.UInt32(2)",
     ),
     mutant(
-        "mirrors from points: edges count that no mirror shows",
-        "plugins/transport/chain_rays.py",
-        "    sees_all = False",
-        "    sees_all = True",
+        "edges from points: what a mirror shows of a surface stands still when what looks into it moves",
+        "plugins/transport/paths.py",
+        "longest = dr.select(onwards.mirrored, dr.minimum(since, before), since)",
+        "longest = since",
     ),
     mutant(
         "mirrors from points: they are not looked for",

@@ -77,9 +77,8 @@ class MirroredTerm(FromPoints):
         behind = at.found & (at.a.depth > 2)
         at.found = behind
         last = log.vertex(dr.maximum(at.a.depth, 3) - 1, behind)
-        # A vertex that is far from the point does not slide with it.
-        slides = point.vicinity.far(dr.square(first[0].pi.t)) < 1
-        since = dr.select(slides, mi.UInt32(1), 2)
+        # Wherever the first mirror is, the direction from which the point looks into it turns the chain.
+        since = mi.UInt32(1)
         start = camera_vertex(first[0].ray, first[0].pi)
         chain = Chain(scene, point.vicinity, held=job.tracer.held)
         where = last, behind, since, job.mode

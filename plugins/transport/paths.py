@@ -170,7 +170,9 @@ def choose_vertices(
         note(vertex, numbers, onwards, active)
         r2 = dr.square(onwards.pi.t)
         slides = onwards.slides | (vicinity.far(r2) < 1)
-        before, since = since, dr.select(slides, since, vertex.depth + 1)
+        # What a mirror shows slides with what looks into it, though the mirror itself does not slide with that.
+        longest = dr.select(onwards.mirrored, dr.minimum(since, before), since)
+        before, since = since, dr.select(slides, longest, vertex.depth + 1)
         density = dr.select(onwards.mirrored, dr.inf, bs.pdf / r2)
         vertex, active = step(vertex, onwards, sampler, depths, active)
         return totals, kept, vertex, since, before, density, moved, active, sampler

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import building
+import drjit as dr
 import mirrors
 import mitsuba as mi
 import numpy as np
 import pytest
 from both_modes import assert_backward_is_forward
+from building import camera, diffuse, horizontal, quad
 from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, compare, derivative_image, finite_differences
+from rimlight.transport.tracer import PathTracer
 
-INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": {"type": "prb_edge", "max_depth": 4}}
+DEEP = {"type": "prb_edge", "max_depth": 4}
+INTEGRATORS = {"direct_edge": {"type": "direct_edge"}, "prb_edge": DEEP}
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
@@ -94,3 +99,34 @@ def test_slopes_jump_for_texture_units_of_gpus_as_well(monkeypatch):
     exact, coarse = found
     # More than what sums of several threads differ by, 2e-8
     assert 1e-4 < np.abs(exact - coarse).sum() / np.abs(exact).sum() < 0.01
+
+
+def test_what_a_mirror_shows_slides_with_what_looks_into_it():
+    """A floor before an upright mirror, and a wall at its other end: of the points of the wall that floor points see in
+    the mirror, by way of points that are held, each moves the other way as the camera goes along both."""
+    mirror, wall = (
+        quad((9, 0, z), (-18, 0, 0), (0, 9, 0), name, bsdf=bsdf)
+        for z, name, bsdf in ((2, "mirror", {"type": "conductor"}), (-3, "wall", diffuse(0.5, two_sided=True)))
+    )
+    floor = horizontal((0, 0, 0), 9, "floor", bsdf=diffuse(0.5))
+    scene = building.scene(sensor=camera((0, 0.5, 0), (0, 0, 0.02), fov=20), floor=floor, mirror=mirror, wall=wall)
+    motion, tracer = Motion(scene, "sensor.to_world", direction=[1, 0, 0]), PathTracer(scene, mi.load_dict(DEEP))
+    θ = mi.Float(0)
+    dr.enable_grad(θ)
+    motion.apply(θ)
+    sensor, sampler = scene.sensors()[0], mi.load_dict({"type": "independent"})
+    sampler.seed(0, 4096)
+    dr.forward(θ, dr.ADFlag.ClearEdges)
+    ray, _ = sensor.sample_ray(0, 0.5, sampler.next_2d(), sampler.next_2d())
+    with dr.suspend_grad():
+        walk = tracer.walk(dr.detach(ray), sampler, [0])
+        _, chosen = tracer.point(ray, walk, dr.ADMode.Forward)
+    with dr.resume_grad():
+        moved = np.array(dr.grad(chosen.leaves[0])).reshape(3, -1)
+    n, depth = np.array(dr.detach(chosen.si.n)), np.array(chosen.depth)
+    last = np.array(chosen.log.vertex(chosen.depth, chosen.active).ray.o)
+    seen = np.array(chosen.active) & (depth == 3) & (np.abs(n[2]) > 0.5) & (np.abs(last[2] - 2) < 1e-2)
+    x = np.array(chosen.first.ray(chosen.first.pi.t))
+    expected = -5 / (2 - x[2])
+    assert seen.sum() > 50
+    np.testing.assert_allclose(moved[0][seen], expected[seen], rtol=1e-3)
