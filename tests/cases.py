@@ -37,7 +37,7 @@ from hidden_lights import HIDDEN
 from instances import INSTANCES
 from joints import JOINTS
 from leaves import LEAVES, SEEN_THROUGH
-from mirrors import MIRRORS, ball_of_index
+from mirrors import MIRRORS, ball_of_index, lamp_in_bulb
 from polished import POLISHED
 from random_scenes import ball
 from rooms import BOARD_ALONG, BOX_ALONG, ROOMS, box_behind_glass, hidden_shadow
@@ -955,6 +955,17 @@ CASES = [
     Case("sky_blocker", sky_blocker, BLOCKER_SIDE, 5e-2, spp=256, runs=48),
     *(Case(k, *of, spp=64, runs=12, integrator=prb_edge(4), reference_spp=4096) for k, of in ROOMS.items()),
     Case("hidden_shadow", hidden_shadow, BOARD_ALONG, 1e-2, spp=128, runs=24, integrator=prb_edge(3)),
+    Case(
+        "lamp_in_bulb",
+        lamp_in_bulb,
+        {"key": "lamp.to_world", "direction": [0, 1, 0]},
+        1e-2,
+        spp=128,
+        runs=24,
+        integrator=bdpt_edge(4),
+        reference_images="bdpt",
+        reference_spp=4096,
+    ),
     Case("glass_index", ball_of_index, INDEX, 5e-3, integrator=prb_edge(6), reference_spp=1024),
     Case("box_behind_glass", box_behind_glass, BOX_ALONG, 1e-2, spp=256, runs=24, integrator=prb_edge(3)),
     *(

@@ -66,6 +66,14 @@ def glass_throws() -> mi.Scene:
     return scene(sensor=at, floor=floor, cube=dark, ball=ball, sky=constant(0.5))
 
 
+def lamp_in_bulb() -> mi.Scene:
+    """A lamp in a ball of glass, over a floor: only the floor is seen."""
+    lamp = {"type": "sphere", "center": [0.08, -0.05, 0.06], "radius": 0.1, "emitter": light(9, 9, 9)}
+    bulb = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric"}}
+    floor = horizontal((0, -1, 0), 3, "floor", bsdf=diffuse(0.5))
+    return scene(sensor=camera((0, 1, -3), (0, -1.2, -0.5), fov=22), floor=floor, lamp=lamp, bulb=bulb)
+
+
 def glass_tetrahedron() -> mi.Scene:
     """A tetrahedron of glass under a sky, whose faces meet at less than a right angle."""
     vertices, _, _, faces = tetrahedron()

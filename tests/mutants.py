@@ -273,8 +273,8 @@ MUTANTS = [
     mutant(
         "mirrors from points: they are not looked for",
         "plugins/integrators/_search.py",
-        "mirrored = bool(chains[0] and sppi",
-        "mirrored = bool(chains[0] and 0",
+        "mirrored = bool(any_mirror and sppi",
+        "mirrored = bool(any_mirror and 0",
     ),
     mutant(
         "mirrors and textures: seams of texture coordinates count twice",

@@ -19,7 +19,6 @@ from rimlight.edge_sampling import (
     objects_below,
 )
 from rimlight.edge_sampling.geometry.beams import BEAMS, has_hard_beam
-from rimlight.edge_sampling.geometry.boxes import box_of
 from rimlight.edge_sampling.geometry.grids import grids_of
 from rimlight.edge_sampling.geometry.meshes import has_normal_map, inner, lets_rays_through, surfaces
 from rimlight.edge_sampling.geometry.other_cuts import cuts_of_grids, cuts_of_others, cuts_of_tubes
@@ -105,14 +104,12 @@ def lasting_limits(
     *,
     planes: bool,
     from_points: bool,
-    from_surfaces: bool,
 ) -> tuple[str, ...]:
     """What the derivative will lack as long as the edges stay what they are. lined : see `appearance`. planes,
-    from_points, from_surfaces : see `BoundarySearch`."""
+    from_points : see `BoundarySearch`."""
     limits = []
     if sppi:
-        limits += reflected_light(scene, geometry, depths, from_points=from_points, from_surfaces=from_surfaces)
-        limits += shut_in_lamps(scene, moving) if depths.scatters(2) and from_surfaces else []
+        limits += reflected_light(scene, geometry, depths, from_points=from_points)
         if depths.scatters(1):
             limits += coarse_lamps(scene, depths, planes=planes) + distant_scene(scene)
             limits += [] if planes else coarse_meshes(scene)
@@ -124,9 +121,7 @@ def lasting_limits(
     )
 
 
-def reflected_light(
-    scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool, from_surfaces: bool
-) -> list[str]:
+def reflected_light(scene: mi.Scene, geometry: Geometry, depths: Depths, *, from_points: bool) -> list[str]:
     """What lacks of the light that surfaces reflect."""
     limits = []
     if not from_points and (depths.scatters(2) or scene.environment() is not None):
@@ -140,12 +135,10 @@ def reflected_light(
             f"the derivative lacks the border of the beams of {listed(beams)}: give a spot a beam_width below its "
             "cutoff_angle, and a projector an image with a black border."
         )
-    sought = from_points and (not depths.scatters(2) or not from_surfaces)
-    if not sought and any(is_mirror(s) for s in surfaces(scene)):
-        lacks = "outlines in the light that perfect mirrors and glass throw on other surfaces"
-        lacks = lacks if from_points else "what perfect mirrors and glass show"
+    if not from_points and any(is_mirror(s) for s in surfaces(scene)):
         limits.append(
-            f'the derivative lacks the motion of {lacks}; give them a roughness, or set "sppi" to 0 to accept this.'
+            "the derivative lacks the motion of what perfect mirrors and glass show; give them a roughness, or set "
+            '"sppi" to 0 to accept this.'
         )
     limits += veils(scene, from_points=from_points) if depths.scatters(2) else []
     casts = names(s for s in geometry.others if not s.is_emitter())
@@ -165,20 +158,6 @@ def veils(scene: mi.Scene, *, from_points: bool) -> list[str]:
     return [
         "the derivative lacks part of the motion of what is seen, and of what shines, through "
         f'{listed(names(through))}; cut the meshes out, or set "max_depth" to 2 or "sppi" to 0 to accept this.'
-    ]
-
-
-def shut_in_lamps(scene: mi.Scene, moving: Moving) -> list[str]:
-    """What lacks of the motion of lamps in bulbs of smooth glass: light samples do not go through the glass, and what
-    it shows slides over a lamp, so that the whole derivative is at the outlines behind it."""
-    lamps = [s for s in moving.shapes if s.is_emitter()]
-    lets_light_through = mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission
-    bulbs = [s for s in surfaces(scene) if s.bsdf() is not None and s.bsdf().flags() & lets_light_through]
-    shut_in = [(lamp, bulb) for bulb in bulbs for lamp in lamps if lamp != bulb and box_of(bulb).contains(box_of(lamp))]
-    return [
-        f"with respect to the place of {names([lamp])[0]}, the derivative lacks all that its light does behind the "
-        f"smooth glass of {names([bulb])[0]}, in which it is: it may be 0. Give the glass a roughness, or leave it out."
-        for lamp, bulb in shut_in
     ]
 
 

@@ -286,7 +286,7 @@ class BoundarySearch:
         planes = self._face_planes(scene, moving) if soft and sppi else None
         shadows, shading, indirect, lamps = self._in_reflected_light(scene, moving, sppi, horizons)
         lined = self._textures.shapes(moving.sliding) if self.from_points else ()
-        abilities = {"planes": self.planes, "from_points": self.from_points, "from_surfaces": self.from_surfaces}
+        abilities = {"planes": self.planes, "from_points": self.from_points}
         deep = None
         if shading is not None and self.from_surfaces and self.depths.scatters(3):
             deep = DeepShadows(scene, shading.silhouettes)
@@ -298,7 +298,8 @@ class BoundarySearch:
         chains = self._chains(scene, moving, sppi, at_rest)
         coarse = sppi and self.planes and self.depths.scatters(1)
         coarse = LampPlanes.of(scene, self.geometry, FRINGE) if coarse else None
-        mirrored = bool(chains[0] and sppi and self.depths.scatters(2) and not self.from_surfaces)
+        any_mirror = chains[1] is not None
+        mirrored = bool(any_mirror and sppi and self.depths.scatters(2))
         others = LightChoice.of(scene), deep, lamps, horizons, held, coarse, mirrored
         return Boundaries(film, shadows, shading, indirect, planes, *what, limits, slides, *chains, *others)
 

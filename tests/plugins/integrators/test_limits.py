@@ -415,34 +415,6 @@ def test_a_bump_map_that_no_surface_has_is_not_warned_about(wrapped):
     assert not said(scene, "floor.to_world")
 
 
-# ---------------------- Lamps in bulbs ----------------------
-
-
-def lamp_in_bulb(glass: str, place: float = 0.0) -> mi.Scene:
-    """A lamp over a floor, in the middle of a ball of glass, or somewhere else."""
-    lamp = {"type": "sphere", "id": "lamp", "center": [0, 0, 0], "radius": 0.1, "emitter": cases.light(9, 9, 9)}
-    bulb = {"type": "sphere", "id": "bulb", "center": [place, 0, 0], "radius": 0.3, "bsdf": {"type": glass}}
-    floor = cases.horizontal((0, -1, 0), 3, "floor", bsdf=cases.diffuse(0.5))
-    return cases.scene(sensor=cases.camera(), floor=floor, lamp=lamp, bulb=bulb)
-
-
-@pytest.mark.parametrize(
-    ("glass", "place", "key", "warned"),
-    [
-        ("thindielectric", 0.0, "lamp.to_world", True),
-        ("dielectric", 0.0, "lamp.to_world", True),
-        ("roughdielectric", 0.0, "lamp.to_world", False),
-        ("thindielectric", 1.0, "lamp.to_world", False),
-        ("thindielectric", 0.0, "floor.bsdf.reflectance.value", False),
-    ],
-)
-@pytest.mark.parametrize("kind", ["prb_edge", "bdpt_edge"])
-def test_lamps_that_move_in_smooth_bulbs_are_warned_about(kind, glass, place, key, warned):
-    found = said(lamp_in_bulb(glass, place), key, kind=kind, max_depth=4)
-    warned &= kind == "bdpt_edge"  # `prb_edge` has what mirrors and glass throw
-    assert any('with respect to the place of "lamp", the derivative lacks all' in m for m in found) == warned
-
-
 # ---------------------- Textures that slide ----------------------
 
 
