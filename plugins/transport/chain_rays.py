@@ -71,11 +71,10 @@ class PointRays:
     #: A jump that no mirror shows is found otherwise, as an edge.
     sees_all = False
 
-    #: The square, in units in which a segment is looked for as in one of pixels.
-    offset, size = mi.ScalarVector2f(0), mi.ScalarVector2f(SIDE)
-
     def __init__(self, scene: mi.Scene, si: mi.SurfaceInteraction3f, before: mi.UInt32, like: mi.Ray3f, below: mi.Bool):
         self.scene, self.si, self.before, self.like = scene, si, before, like
+        #: Of the square, in lengths of a segment.
+        self.offset, self.size = mi.ScalarVector2f(0), mi.ScalarVector2f(SIDE)
         facing = dr.mulsign(mi.Vector3f(si.n), si.wi.z * dr.dot(si.n, si.sh_frame.n))
         self.frame = mi.Frame3f(mi.Normal3f(dr.select(below, -facing, facing)))
 
