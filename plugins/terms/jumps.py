@@ -285,7 +285,7 @@ def find_segment(
         (dr.zeros(mi.UInt32, width), nothing, dr.zeros(mi.Float, width), sampler),
         lambda k, *_: k < candidates,
         candidate,
-        label="segments of the film",
+        label="segments",
     )
     kept.weight = total / candidates
     return kept

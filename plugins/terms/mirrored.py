@@ -37,7 +37,9 @@ class MirroredTerm(FromPoints):
     def planned(self, job: Job) -> PlannedTerm:
         count = job.counts.shading * job.pixels if self.boundary(job) else 0
         why = "perfect mirrors or glass may throw light on other surfaces"
-        return self.plan(count, RAYS + 2 * job.rays_of_path, why, "no mirrors or glass before indirect light")
+        return self.plan(
+            count, RAYS + 2 * job.rays_of_path, why, "no perfect mirrors or glass, no indirect light, or nothing moves"
+        )
 
     def boundary(self, job: Job) -> bool:
         return job.boundaries.mirrored
@@ -56,7 +58,7 @@ class MirroredTerm(FromPoints):
         active = point.active & (segment.weight > 0) & dr.all((middle >= corners[0]) & (middle < corners[1]))
         weight = rays.weight(middle, active) * dr.select(both, 2, mi.Float(1)) * point.β
         active &= dr.any(weight != 0)
-        # As in `BisectionTerm`.
+        # What is found here is used again in the kernels of the gradients, which are not to look for it again.
         sampler.schedule_state()
         dr.eval(segment, weight, active)
         at, moving = self._where_they_part(job, chains, segment, point, active)

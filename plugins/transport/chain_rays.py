@@ -75,7 +75,7 @@ class PointRays:
         self.scene, self.si, self.before, self.like = scene, si, before, like
         #: Of the square, in lengths of a segment.
         self.offset, self.size = mi.ScalarVector2f(0), mi.ScalarVector2f(SIDE)
-        facing = dr.mulsign(mi.Vector3f(si.n), si.wi.z * dr.dot(si.n, si.sh_frame.n))
+        facing = dr.mulsign(mi.Vector3f(si.n), dr.dot(si.n, si.to_world(si.wi)))
         self.frame = mi.Frame3f(mi.Normal3f(dr.select(below, -facing, facing)))
 
     def direction(self, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:

@@ -1,8 +1,8 @@
-"""What perfect mirrors and glass show to the camera, as a function of the position on the film.
+"""What perfect mirrors and glass show to the camera, or to a point, as a function of a position in the plane.
 
 Behind a chain of mirrors there is no projection by which an edge could be found on the film. So its image is looked
-for: along a short segment of the film, what the chain ends at is compared at both ends, and where it differs, the
-segment is bisected (`terms/mirrors.py`). Here chains are followed, and two of them compared.
+for: along a short segment of the plane, what the chain ends at is compared at both ends, and where it differs, the
+segment is bisected (`terms/jumps.py`). Here chains are followed, and two of them compared.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class Parting:
 
 
 class Chains:
-    """Follows chains of mirrors from the camera.
+    """Follows chains of mirrors from the camera, or from points.
 
     boundaries : with what is known of mirrors, of textures whose lines count, and of surfaces.
     """
