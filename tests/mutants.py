@@ -309,8 +309,14 @@ MUTANTS = [
     mutant(
         "film boundary: lines in which meshes cut each other count where something hides them",
         "edge_sampling/geometry/device_edges.py",
-        "hidden = dr.select(of(self._is_line), self._is_hidden_line(positions, edge, p, rays, met), hidden)",
+        "hidden = dr.select(of(self._is_line), hidden_line, hidden)",
         "hidden &= ~of(self._is_line)",
+    ),
+    mutant(
+        "film boundary: silhouettes that lie in another surface count as lines, too",
+        "edge_sampling/geometry/device_edges.py",
+        "hidden_line |= self._repeats_silhouette(positions, edge, eye, view)",
+        "pass",
     ),
     mutant(
         "film boundary: curves in which spheres cut other shapes follow one of both only",
@@ -566,14 +572,20 @@ MUTANTS = [
     mutant(
         "intersections: lines that run along the edges of a floor are lost",
         "edge_sampling/geometry/intersections.py",
-        "goes_through |= in_plane & (height(q) > slack) & flat & ~dr.gather(mi.Bool, self._jumps, side)",
+        "goes_on |= here",
         "pass",
     ),
     mutant(
         "intersections: what only touches cuts",
         "edge_sampling/geometry/intersections.py",
-        "            cut &= goes_through",
+        "            cut &= goes_through | self._goes_on(positions, face, plane, slack)[0]",
         "            pass",
+    ),
+    mutant(
+        "intersections: edges do not rest",
+        "edge_sampling/geometry/intersections.py",
+        "dr.scatter(of_place, 1, dr.gather(mi.UInt32, self._place_of, end), goes_on & ~too)",
+        "pass",
     ),
     mutant(
         "edges: a box on the edges of a floor moves with these",

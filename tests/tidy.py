@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from building import camera, constant, diffuse, mesh, quad, scene
 from random_rooms import box, joined
+from random_scenes import ball
 
 
 def block(name: str, low: tuple, high: tuple, *colour: float) -> mi.Mesh:
@@ -36,6 +37,17 @@ def box_on_lines() -> mi.Scene:
     board = {"type": "checkerboard", "color0": 0.1, "color1": 0.8, "to_uv": place}
     on = floor({"type": "diffuse", "reflectance": board})
     return seen(floor=on, box=block("box", (-0.5, 0, -0.5), (0.5, 1, 0.5), 0.6), sky=constant(0.3))
+
+
+def dome() -> mi.Scene:
+    """A smooth-shaded ball stands in a floor exactly to a ring of its edges, above and below which faces look at a low
+    camera."""
+    points, _, _, faces = ball(8)
+    points = np.round(0.5 * points[:, [1, 2, 0]], 6)  # the ring at the height 0
+    thing = mesh("ball", points, faces, normals=True, bsdf=diffuse(0.2, 0.5, 0.8))
+    bulb = {"type": "point", "position": [1.2, 2.5, -1.4], "intensity": 8.0}
+    low = camera((0.3, 0.45, -3.4), (0.03, 0.13, 0.01), fov=24)
+    return scene(sensor=low, floor=floor(), ball=thing, bulb=bulb, sky=constant(0.4))
 
 
 def stair() -> mi.Scene:
@@ -173,6 +185,7 @@ BOX = {"key": "box.vertex_positions", "direction": [1, 0, 0.4]}
 #: Scene, motion, step.
 TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
     "box_on_lines": (box_on_lines, CAMERA, 2e-3),
+    "dome": (dome, CAMERA, 2e-3),
     "stair": (stair, CAMERA, 2e-3),
     "shelf": (shelf, CAMERA, 2e-3),
     "can_on_box": (can_on_box, CAMERA, 2e-3),

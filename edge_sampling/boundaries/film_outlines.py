@@ -8,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rimlight.edge_sampling.geometry.common_line import cut_by_plane
 from rimlight.edge_sampling.geometry.curve_point import CurvePoint
 from rimlight.edge_sampling.geometry.curves import Curves
 from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import EdgeKind, Edges
 from rimlight.edge_sampling.geometry.grids import grids_of, is_grid, normals
-from rimlight.edge_sampling.geometry.intersections import cut_by_plane
 from rimlight.edge_sampling.geometry.meshes import Geometry
 from rimlight.edge_sampling.projection.sensors import FilmPoint, Projection
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from rimlight.edge_sampling.geometry.common_line import stay_on
 from rimlight.edge_sampling.geometry.curves import Curves
 from rimlight.edge_sampling.geometry.cut_curves import BOUNDS, arc, conic, interval
 from rimlight.edge_sampling.geometry.cut_surfaces import KINDS, TURN, Kind, Surface
-from rimlight.edge_sampling.geometry.intersections import stay_on
 from rimlight.edge_sampling.projection.sensors import Projection
 
 #: Where an arc of a curve may begin: at one of the two ends of a cylinder, or anywhere.

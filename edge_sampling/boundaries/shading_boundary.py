@@ -218,7 +218,8 @@ class ShadingBoundary:
                 crease = self.silhouettes.crease(e, outline) * near
                 # The closer an edge is, the faster its direction turns; but behind a veil, as fast as that is close.
                 turn = dr.select(aimed, 1, dr.rsqrt(r2)) * self.silhouettes.preferred(e, use)
-                jumps = dr.select(seen_past | outline.is_line | outline.crosses, 1, crease)
+                jumps = dr.select(seen_past | outline.crosses, 1, crease)
+                jumps = dr.select(outline.is_line, dr.select(seen_past, mi.Float(0), 1), jumps)
                 return e, dr.max(f) * arc * turn * dr.select(emitted | aim.counts(ω), jumps, 0)
 
             many = tracer.scatters(2) or tracer.lamps is not None
@@ -378,9 +379,10 @@ class ShadingBoundary:
         if not self.silhouettes.lines:
             return outward, n_dl
         # Beside a line in which meshes cut through each other, both sides slide past it. One of them is looked at, by
-        # chance.
+        # chance. Where it is an edge that is a silhouette, that counts in its place.
         one = dr.select(sampler.next_1d(active) < 0.5, mi.Float(1), -1)
-        return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, 2 * n_dl, n_dl)
+        of_line = dr.select(outward == 0, 2 * n_dl, 0)
+        return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, of_line, n_dl)
 
     def _emitted(
         self, tracer, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool

@@ -258,6 +258,7 @@ class Silhouettes:
         first, second = (dr.normalize(n) for n in outline.normals)
         edge = dr.select(sample.edge < self.count, sample.edge, 0)
         of_edges = self.tree.device_edges.crease(edge, dr.norm(dr.cross(first, second)))
+        of_edges = dr.select(self.tree.device_edges.rests(edge), 0, of_edges)
         return dr.select(sample.edge < self.count, of_edges, of_rims)
 
     def preferred(self, sample: EdgeSample, use: list[mi.Float | float]) -> mi.Float:

@@ -25,10 +25,11 @@ import mitsuba as mi
 import numpy as np
 
 from .boxes import box_of
+from .common_line import IN_ONE_PLANE, stay_on
 from .cut_surfaces import BEYOND, KINDS, STEEP, TURN, WITHIN, Kind, Surface, across, nearest, triangles, trim
 from .edges import Edges
 from .grids import is_grid
-from .intersections import IN_ONE_PLANE, LEAST_SPACE, VERTICES, line_edges, stay_on
+from .intersections import LEAST_SPACE, VERTICES, line_edges
 from .meshes import Geometry, faces, positions_of
 
 #: Least depth to which a plane must be sunk in a sphere, relative to its radius.

@@ -171,12 +171,14 @@ class DeviceEdges:
         of = lambda kind: dr.gather(mi.Bool, kind, edge)
         fold = of(self._two_faces) & ~self.is_silhouette(positions, edge, eye, view)
         covered = (covers[0] | covers[1]) & ~(shown[0] | shown[1])
-        hidden = dr.select(fold, ~(shown[0] & shown[1]), covered)
+        hidden = dr.select(fold, ~(shown[0] & shown[1]) | self.rests(edge), covered)
         hidden = dr.select(of(self._few_faces), hidden, ~reached)
         edge_on = [are_edge_on(n, rays[0].d) for n in normals]
         hidden |= (edge_on[0] | edge_on[1]) & (before | ~reached)
         if self._any_lines:
-            hidden = dr.select(of(self._is_line), self._is_hidden_line(positions, edge, p, rays, met), hidden)
+            hidden_line = self._is_hidden_line(positions, edge, p, rays, met)
+            hidden_line |= self._repeats_silhouette(positions, edge, eye, view)
+            hidden = dr.select(of(self._is_line), hidden_line, hidden)
         return hidden
 
     # ---------------------- Of grids ----------------------
@@ -215,6 +217,28 @@ class DeviceEdges:
                 there = dr.select(curved, self.curves.is_met(positions, piece, p, ray, si.p, slack), there)
             missed |= ~(si.is_valid() & there) & ~self._lets_through(si)
         return missed
+
+    def rests(self, edge: mi.UInt32) -> mi.Bool:
+        """Does an edge lie in another surface, through which its own one goes on? Then, unless it is a silhouette, a
+        line counts in its place."""
+        of_lines = [lines.rests for lines in self._lines if lines.straight]
+        if not of_lines:
+            return mi.Bool(False)
+        ends = [dr.gather(mi.UInt32, end, edge) for end in self._ends[0]]
+        of_mesh = (ends[0] < dr.width(of_lines[0])) & (ends[1] < dr.width(of_lines[0]))
+        first, second = (dr.gather(mi.Bool, of_lines[0], end, of_mesh) for end in ends)
+        return first & second
+
+    def _repeats_silhouette(
+        self, positions: mi.Float, edge: mi.UInt32, eye: mi.Point3f, view: mi.Vector3f | None
+    ) -> mi.Bool:
+        """Is a line in which shapes cut through each other an edge of one of them, and that a silhouette? Both sides of
+        other lines lie in one plane."""
+        a, _ = self.end_points(positions, edge)
+        towards = -view if view is not None else eye - a
+        first, second = self.normals(positions, edge)
+        alike = (dr.dot(first, towards) > 0) == (dr.dot(second, towards) > 0)
+        return alike & ~are_edge_on(first, towards) & ~are_edge_on(second, towards)
 
     def _lets_through(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Can rays go through a surface as if nothing was there?"""

@@ -6,9 +6,10 @@ own, a little inside of it, which meet the very faces that it cuts. (On the side
 faces where a side goes through the edge between them, as a box does whose corner stands on the diagonal of a floor.)
 Most pairs are found several times, and count once.
 
-A box also may stand in a floor exactly along edges of that. Both surfaces go on, so there is a line, but none of these
-triangles goes through another one. There, that which ends at the line from below stands for the surface: what is in a
-plane, within rounding, counts as above it, if the surface goes on above it.
+Shapes also may stand in a floor exactly along edges of theirs, or of its own. Both surfaces go on, so there is a line,
+but none of these triangles goes through another one. There, that which ends at the line from below stands for the
+surface: what is in a plane, within rounding, counts as above it, if the surface goes on above it. Where such an edge is
+a silhouette, it counts by itself, and the line does not.
 
 The line moves as the planes do. A point p of it has no velocity of its own along the line; across it, ṗ = α n₁ + β n₂
 with α and β such that p stays in both planes: nᵢ · ṗ = −ġᵢ, gᵢ = nᵢ · (p − cᵢ) with a corner cᵢ. What is seen on
@@ -17,7 +18,6 @@ either side is *not* fixed to the line, as it is to an edge: both surfaces slide
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -26,15 +26,13 @@ import numpy as np
 
 from .beside import rounding
 from .boxes import box_of
+from .common_line import common_line, follow, normal_of, slack_of
 from .edges import WHOLE, EdgeKind, Edges, Weld, distinct_rows
 from .grids import is_grid
 from .half_edges import HalfEdges, edge_key
 from .mesh_numbers import first_meshes, numbers_in_groups
 from .meshes import Geometry, positions_of, tells_shapes_in_groups
 from .rigid_motion import Shapes
-
-#: Triangles whose planes have a smaller sine between them do not cut each other: they lie in one plane.
-IN_ONE_PLANE = 1e-4
 
 #: An edge is followed through at most so many faces.
 MOST_FACES = 1024
@@ -46,8 +44,8 @@ INSIDE, LONGER = 4, 16
 #: Vertices that stand for the line of one pair: its two ends, and a point on each side of it.
 VERTICES = 4
 
-#: Corners of the two triangles of a pair.
-CORNERS = 6
+#: Corners of the two triangles of a pair; and where the line is an edge of one of them, those opposite to it.
+CORNERS, OPPOSITE = 6, 2
 
 #: Least number of pairs for which there is space.
 LEAST_SPACE = 64
@@ -74,14 +72,15 @@ class Intersections:
     There is space for `capacity` pairs of triangles. What is not needed has the length 0.
     """
 
-    DRJIT_STRUCT = dict.fromkeys(("corners",))  # for `dr.freeze`
+    DRJIT_STRUCT = dict.fromkeys(("corners", "rests"))  # for `dr.freeze`
 
     #: Are its lines straight?
     straight = True
 
     def __init__(self, scene: mi.Scene, geometry: Geometry, edges: Edges, weld: Weld):
         faces = geometry.faces((True,) * len(geometry.meshes)).astype(np.int64)
-        self._corner, self._place = _index(faces.ravel()), weld.place
+        self._corner, self._place, self._place_of = _index(faces.ravel()), weld.place, _index(weld.place)
+        self._places = int(weld.place.max(initial=-1)) + 1
         self._beside = lambda: _beside(geometry, edges, weld, faces)
         #: See there.
         self._beyond: mi.UInt32 | None = None
@@ -97,8 +96,11 @@ class Intersections:
         self.count = self.capacity = 0
         #: Meshes that may cut each other, since their boxes overlap: their numbers.
         self.shapes: tuple[int, ...] = ()
-        #: Six vertices of each pair of triangles: (capacity,) each.
+        #: Six vertices of each pair of triangles, and two more, which are one and the same where the line is no edge:
+        #: (capacity,) each.
         self.corners: list[mi.UInt32] = []
+        #: Which vertices are ends of an edge that lies in another surface, through which its own one goes on: (V,).
+        self.rests = dr.opaque(mi.Bool, False, max(len(weld.place), 1))
         #: Meshes that cut through themselves. Others may come to do so when their shapes change.
         self._by_themselves: set[int] = set()
         self._forms = Shapes(geometry)
@@ -125,6 +127,7 @@ class Intersections:
     def _search(self, scene: mi.Scene, positions: mi.Float, boxes: dict[int, np.ndarray]) -> None:
         """Find the pairs, and which meshes cut through themselves. boxes : meshes, and where to look for what cuts
         each: (2, 3)."""
+        self.rests = dr.opaque(mi.Bool, False, dr.width(self.rests))
         walked = self._sides_of(tuple(sorted(boxes))) if boxes else ()
         if not len(walked):
             self._keep([], 0)
@@ -143,23 +146,25 @@ class Intersections:
             found = [dr.zeros(mi.UInt32, count) for _ in range(2)]
             some = _Walked(*(dr.gather(mi.UInt32, n, reaching) for n in (walked.side, walked.mesh)))
             self._walk(scene, positions, some, within, into=found, start=start)
+            found[0] = self._from_below(positions, *found)
             cutting = dr.compress(self._cut(positions, *found))
             count = dr.width(cutting)
         if count:
-            found, count = self._each_once([dr.gather(mi.UInt32, f, cutting) for f in found])
+            found, count = self._each_once(positions, [dr.gather(mi.UInt32, f, cutting) for f in found])
         if count > self.capacity:
             self.capacity = max(LEAST_SPACE, 1 << (2 * count - 1).bit_length())
         self._keep(found if count else [], count)
 
-    def _each_once(self, found: list[mi.UInt32]) -> tuple[list[mi.UInt32], int]:
-        """Corners of pairs of triangles, each once, and of repeated triangles once; and how many."""
+    def _each_once(self, positions: mi.Float, found: list[mi.UInt32]) -> tuple[list[mi.UInt32], int]:
+        """Corners of pairs of triangles, see `corners`, each once, and of repeated triangles once; and how many."""
         pairs = np.stack([f.numpy() for f in found], 1)
         mesh = np.searchsorted(np.cumsum(self._counts), pairs, side="right")
         self._by_themselves = set(mesh[mesh[:, 0] == mesh[:, 1], 0].tolist())
         corners = self._corner.numpy().reshape(-1, 3)[pairs]
         triangle = distinct_rows(np.sort(self._place[corners], axis=2).reshape(-1, 3))[1].reshape(-1, 2)
         first = np.sort(distinct_rows(np.sort(triangle, axis=1))[0])
-        return [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)], len(first)
+        of_pairs = [_index(corners.reshape(-1, CORNERS)[first, k]) for k in range(CORNERS)]
+        return of_pairs + self._of_edges(positions, *(_index(pairs[first, k]) for k in (0, 1))), len(first)
 
     def _keep(self, found: list[mi.UInt32], count: int) -> None:
         """Fill up what is not needed with a vertex, which makes triangles without area."""
@@ -167,8 +172,9 @@ class Intersections:
         if self.capacity:
             slot = dr.arange(mi.UInt32, self.capacity)
             used = slot < dr.opaque(mi.UInt32, count)
-            self.corners = [dr.gather(mi.UInt32, f, slot, used) for f in found or [dr.zeros(mi.UInt32, 1)] * CORNERS]
-            dr.eval(self.corners)
+            found = found or [dr.zeros(mi.UInt32, 1)] * (CORNERS + OPPOSITE)
+            self.corners = [dr.gather(mi.UInt32, f, slot, used) for f in found]
+            dr.eval(self.corners, self.rests)
 
     def _sides_of(self, meshes: tuple[int, ...]) -> _Walked:
         if self._beyond is None:
@@ -264,23 +270,55 @@ class Intersections:
     def _cut(self, positions: mi.Float, own: mi.UInt32, met: mi.UInt32) -> mi.Bool:
         """Do two triangles cut each other?"""
         mine, other = self._triangle(positions, own), self._triangle(positions, met)
-        slack = _slack(mine, other)
+        slack = slack_of(mine, other)
         cut = common_line(mine, other)[2]
         for face, corners, plane in ((own, mine, other), (met, other, mine)):
-            n = _normal(plane)
-            height = lambda p, n=n, plane=plane: dr.dot(n, p - plane[0])
-            heights = [height(p) for p in corners]
+            heights = [dr.dot(normal_of(plane), p - plane[0]) for p in corners]
             goes_through = (heights[0] > slack) | (heights[1] > slack) | (heights[2] > slack)
-            for k in range(3):
-                i, j = k, (k + 1) % 3
-                side = 3 * face + k
-                beyond = self._corners_of(dr.gather(mi.UInt32, self._beyond, side))[2]
-                q = dr.gather(mi.Point3f, positions, beyond)
-                flat = dr.norm(dr.cross(_normal(corners), _normal([corners[i], corners[j], q]))) <= IN_ONE_PLANE
-                in_plane = (dr.abs(heights[i]) <= slack) & (dr.abs(heights[j]) <= slack)
-                goes_through |= in_plane & (height(q) > slack) & flat & ~dr.gather(mi.Bool, self._jumps, side)
-            cut &= goes_through
+            cut &= goes_through | self._goes_on(positions, face, plane, slack)[0]
         return cut
+
+    def _from_below(self, positions: mi.Float, own: mi.UInt32, met: mi.UInt32) -> mi.UInt32:
+        """In the place of triangles that end from above in the plane of another one, those beyond their side there. Of
+        these, a ray may meet the former alone, where the other triangle is at the same place."""
+        plane = self._triangle(positions, met)
+        slack = slack_of(self._triangle(positions, own), plane)
+        goes_on, side = self._goes_on(positions, own, plane, slack, below=True)
+        return dr.select(goes_on, dr.gather(mi.UInt32, self._beyond, side) // 3, own)
+
+    def _goes_on(
+        self, positions: mi.Float, face: mi.UInt32, plane: list[mi.Point3f], slack: mi.Float, *, below: bool = False
+    ) -> tuple[mi.Bool, mi.UInt32]:
+        """Has a face a side in a plane, beyond which the surface goes on above that, or below it; and which? Only
+        edges of two faces are asked: others count wherever they lie."""
+        height = lambda c: dr.dot(normal_of(plane), dr.gather(mi.Point3f, positions, c) - plane[0])
+        goes_on, side = dr.full(mi.Bool, False, dr.width(face)), mi.UInt32(3 * face)
+        for k in range(3):
+            a, b, _ = self._corners_of(3 * face + k)
+            above = self._corners_of(dr.gather(mi.UInt32, self._beyond, 3 * face + k))[2]
+            here = (dr.abs(height(a)) <= slack) & (dr.abs(height(b)) <= slack)
+            here &= height(above) < -slack if below else height(above) > slack
+            here &= ~dr.gather(mi.Bool, self._jumps, 3 * face + k)
+            goes_on |= here
+            side = dr.select(here, 3 * face + k, side)
+        return goes_on, side
+
+    def _of_edges(self, positions: mi.Float, own: mi.UInt32, met: mi.UInt32) -> list[mi.UInt32]:
+        """Of lines that are edges of one of two triangles, the vertices opposite to them, below and above the other
+        triangle; of other lines, the same one twice. And find which vertices rest."""
+        mine, other = self._triangle(positions, own), self._triangle(positions, met)
+        slack, opposite = slack_of(mine, other), [mi.UInt32(0), mi.UInt32(0)]
+        of_place = dr.zeros(mi.UInt32, self._places)
+        # A line that is an edge of both surfaces stays one where either is a silhouette.
+        found = [self._goes_on(positions, face, plane, slack) for face, plane in ((own, other), (met, mine))]
+        for (goes_on, side), (too, _) in zip(found, found[::-1], strict=True):
+            a, b, below = self._corners_of(side)
+            above = self._corners_of(dr.gather(mi.UInt32, self._beyond, side))[2]
+            opposite = [dr.select(goes_on & ~too, c, o) for c, o in zip((below, above), opposite, strict=True)]
+            for end in (a, b):
+                dr.scatter(of_place, 1, dr.gather(mi.UInt32, self._place_of, end), goes_on & ~too)
+        self.rests = dr.gather(mi.UInt32, of_place, self._place_of) != 0
+        return opposite
 
     # ---------------------- As edges ----------------------
 
@@ -290,26 +328,30 @@ class Intersections:
         return VERTICES * self.capacity
 
     def points(self, of_meshes: list[mi.Float]) -> list[mi.Point3f]:
-        """The vertices of all lines, first their lower ends, then their upper ends, then points of the first triangle's
-        plane on both sides: `VERTICES` times (capacity,), world space; attached.
+        """The vertices of all lines, first their lower ends, then their upper ends, then points on both sides:
+        `VERTICES` times (capacity,), world space; attached. These are in the first triangle's plane, or where a line is
+        an edge, in those of its faces.
 
         of_meshes : positions of the vertices of each mesh, (3 V,).
         """
         positions = dr.concat(of_meshes)
         corners = [dr.gather(mi.Point3f, positions, c) for c in self.corners]
-        first, second = corners[:3], corners[3:]
+        first, second, (below, above) = corners[:3], corners[3:CORNERS], corners[CORNERS:]
+        is_edge = self.corners[CORNERS] != self.corners[CORNERS + 1]
         with dr.suspend_grad():
             still = [[dr.detach(p) for p in t] for t in (first, second)]
             lower, upper, cut = common_line(*still)
             lower, upper = (dr.select(cut, p, still[0][0]) for p in (lower, upper))
-            aside = dr.cross(upper - lower, _normal(still[0]))
+            aside = dr.cross(upper - lower, normal_of(still[0]))
             sides = [mi.Point3f(lower + dr.select(cut, s * aside, 0)) for s in (1, -1)]
-        return [*(_follow(p, first, second, cut) for p in (lower, upper)), *sides]
+            of_edge = dr.detach(below), dr.detach(above)
+            sides = [dr.select(is_edge & cut, p, q) for p, q in zip(of_edge, sides, strict=True)]
+        return [*(follow(p, first, second, cut) for p in (lower, upper)), *sides]
 
     def normals(self, positions: mi.Float, line: mi.UInt32, p: mi.Point3f) -> list[mi.Vector3f]:
         """Of both triangles; detached. p : not needed."""
         corners = [dr.gather(mi.Point3f, dr.detach(positions), dr.gather(mi.UInt32, c, line)) for c in self.corners]
-        return [_normal(corners[:3]), _normal(corners[3:])]
+        return [normal_of(corners[:3]), normal_of(corners[3:CORNERS])]
 
     def as_edges(self, edges: Edges, vertices: int) -> Edges:
         """`edges`, and after them these lines, as edges that are boundaries from everywhere.
@@ -341,92 +383,15 @@ def line_edges(edges: Edges, n: int, vertices: int) -> Edges:
 
 
 def _beside(geometry: Geometry, edges: Edges, weld: Weld, faces: np.ndarray) -> tuple[mi.UInt32, mi.Bool]:
-    """Of each side of a triangle, that beyond it, or itself where there is none; and whether the edge is a jump by
-    itself, which a line along it would only repeat: (3 F,)."""
+    """Of each side of a triangle, that beyond it, or itself where there is none; and whether the edge has other numbers
+    of faces than two, so that it counts wherever it lies, and a line along it would only repeat it: (3 F,)."""
     beyond = HalfEdges.of(weld.place, faces).beyond(faces, geometry.host_positions())
     beyond = np.where(beyond < 0, np.arange(faces.size), beyond)
     n = int(weld.place.max()) + 1
     key = lambda ends: edge_key(*weld.place[ends.astype(np.int64)].T, n)
-    goes_on = key(edges.vertices[edges.kind != EdgeKind.JUMP, 0])
+    goes_on = key(edges.vertices[edges.count == 2, 0])
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], 2).reshape(-1, 2)
     return _index(beyond), mi.Bool(np.isin(key(sides), goes_on, invert=True))
-
-
-def common_line(first: list[mi.Point3f], second: list[mi.Point3f]) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
-    """Lower and upper end of the piece of a line that two triangles have in common; do they cut each other? Detached.
-
-    The same for the triangles in another order, but for rounding. What is in a plane, within rounding, counts as above
-    it: so triangles that only touch may be said to cut each other.
-    """
-    normals = _normal(first), _normal(second)
-    along = dr.cross(*normals)
-    cut = dr.norm(along) > IN_ONE_PLANE
-    # Of two opposite directions, that whose largest coordinate is positive.
-    size = dr.abs(along)
-    largest = dr.select(size.x >= dr.maximum(size.y, size.z), along.x, dr.select(size.y >= size.z, along.y, along.z))
-    along = dr.mulsign(dr.normalize(along), largest)
-    slack, ends = _slack(first, second), []
-    for triangle, n, other in ((first, normals[1], second), (second, normals[0], first)):
-        heights = [dr.dot(n, p - other[0]) for p in triangle]
-        above = dr.smallest(mi.Float)
-        a, b, crosses = cut_by_plane(triangle, [dr.select(dr.abs(h) <= slack, above, h) for h in heights])
-        cut &= crosses
-        swap = dr.dot(along, a - b) > 0
-        ends.append((dr.select(swap, b, a), dr.select(swap, a, b)))
-    (a, b), (c, d) = ends
-    lower, upper = dr.select(dr.dot(along, a - c) > 0, a, c), dr.select(dr.dot(along, b - d) > 0, d, b)
-    return lower, upper, cut & (dr.dot(along, upper - lower) > slack)
-
-
-def _slack(first: list[mi.Point3f], second: list[mi.Point3f]) -> mi.Float:
-    """How far from a plane of one of two triangles a corner of the other may seem to lie that is in it."""
-    return dr.maximum(rounding(first[0], second[0]), dr.maximum(rounding(*first[1:]), rounding(*second[1:])))
-
-
-def cut_by_plane(corners: list[mi.Point3f], height: list[mi.Float]) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
-    """Where a plane cuts through a triangle: two points of its sides; and does it? height : of the corners over it."""
-    corners, height = list(corners), list(height)
-    above = [h > 0 for h in height]
-    below = [h < 0 for h in height]
-    crosses = (above[0] | above[1] | above[2]) & (below[0] | below[1] | below[2])
-    # The corner that has the plane between itself and the two others, first.
-    for k in (1, 2):
-        alone = (above[k] != above[0]) & (above[k] != above[3 - k])
-        corners[0], corners[k] = dr.select(alone, corners[k], corners[0]), dr.select(alone, corners[0], corners[k])
-        height[0], height[k] = dr.select(alone, height[k], height[0]), dr.select(alone, height[0], height[k])
-    points = []
-    for k in (1, 2):
-        t = height[0] / dr.select(crosses, height[0] - height[k], 1)
-        points.append(dr.lerp(corners[0], corners[k], dr.clip(t, 0, 1)))
-    return points[0], points[1], crosses
-
-
-def _normal(triangle: list[mi.Point3f]) -> mi.Vector3f:
-    a, b, c = triangle
-    return dr.normalize(dr.cross(b - a, c - a))
-
-
-def _follow(p: mi.Point3f, first: list[mi.Point3f], second: list[mi.Point3f], active: mi.Bool) -> mi.Point3f:
-    """The point p of the line, attached to both triangles."""
-    normals, heights = [], []
-    for triangle in (first, second):
-        n = _normal(triangle)
-        g = dr.dot(n, p - triangle[0])
-        normals.append(dr.detach(n))
-        heights.append(dr.select(active, g - dr.detach(g), 0))
-    return stay_on(p, normals, heights, active)
-
-
-def stay_on(p: mi.Point3f, normals: Sequence, heights: Sequence, active: mi.Bool) -> mi.Point3f:
-    """The point p of two surfaces, attached: it moves in the plane of their normals, so that it stays on both.
-
-    normals : of unit length, detached. heights : over both surfaces, zero, with the gradient for a fixed p.
-    """
-    (n, m), (g, h) = normals, heights
-    cosine = dr.dot(n, m)
-    determinant = dr.select(active, 1 - dr.square(cosine), 1)
-    α, β = (cosine * h - g) / determinant, (cosine * g - h) / determinant
-    return mi.Point3f(p + dr.select(active, n * α + m * β, 0))
 
 
 def _overlapping(geometry: Geometry) -> dict[int, np.ndarray]:

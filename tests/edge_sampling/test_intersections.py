@@ -163,6 +163,22 @@ def test_a_box_on_the_edges_of_a_floor_does_not_cut_it(above, rows, down):
     assert lines.count == 0
 
 
+def test_a_ball_in_a_floor_exactly_to_a_ring_of_its_edges():
+    """The ring is a line, and its edges rest, which no other edges do."""
+    points, _, _, faces = ball(8)
+    floor = horizontal((0, 0, 0), 2, "floor", bsdf=diffuse(0.5))
+    thing = mesh("ball", np.round(points[:, [1, 2, 0]], 6), faces, bsdf=diffuse(0.5))
+    lines, geometry = intersections(scene(floor=floor, ball=thing))
+    assert length(pieces(lines, geometry)) == pytest.approx(2 * 16 * np.sin(np.pi / 16), rel=1e-4)
+    edges, _ = find_welded_edges(geometry)
+    ring = (geometry.host_positions()[edges.vertices[:, 0], 1] == 0).all(1) & (edges.mesh == 1).all(1)
+    assert ring.sum() == 16
+    geometry = replace(geometry, lines=(lines,))
+    all_edges = lines.as_edges(edges, sum(m.vertex_count() for m in geometry.meshes))
+    rests = DeviceEdges(all_edges, geometry).rests(dr.arange(mi.UInt32, len(all_edges))).numpy()
+    assert (rests == np.append(ring, np.zeros(lines.capacity, bool))).all()
+
+
 @pytest.mark.parametrize("first", ["box", "floor"])
 def test_whose_edges_a_box_has_that_stands_on_those_of_a_floor(first):
     shapes = {"floor": tiles(4), "box": upright_box((0, 0, 0), (1, 1, 1))}
