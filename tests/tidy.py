@@ -40,14 +40,14 @@ def box_on_lines() -> mi.Scene:
 
 
 def dome() -> mi.Scene:
-    """A smooth-shaded ball stands in a floor exactly to a ring of its edges, above and below which faces look at a low
-    camera."""
+    """A smooth-shaded ball stands in a floor exactly to a ring of its edges. Some of these are silhouettes, of others
+    both faces look at the camera."""
     points, _, _, faces = ball(8)
     points = np.round(0.5 * points[:, [1, 2, 0]], 6)  # the ring at the height 0
     thing = mesh("ball", points, faces, normals=True, bsdf=diffuse(0.2, 0.5, 0.8))
     bulb = {"type": "point", "position": [1.2, 2.5, -1.4], "intensity": 8.0}
-    low = camera((0.3, 0.45, -3.4), (0.03, 0.13, 0.01), fov=24)
-    return scene(sensor=low, floor=floor(), ball=thing, bulb=bulb, sky=constant(0.4))
+    high = camera((0.3, 3.2, -1.3), (0.03, 0.13, 0.01), fov=24)
+    return scene(sensor=high, floor=floor(), ball=thing, bulb=bulb, sky=constant(0.4))
 
 
 def stair() -> mi.Scene:
