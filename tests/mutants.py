@@ -600,9 +600,15 @@ MUTANTS = [
         "hidden &= of(self._few_faces)",
     ),
     mutant(
+        "film boundary: what leans over its foot darkens what it stands on",
+        "edge_sampling/boundaries/both_sides.py",
+        "farther = touching & (clear > aside)",
+        "farther = mi.Bool(False)",
+    ),
+    mutant(
         "shadows from lights: sides of boxes that stand flush throw shadows on each other",
         "edge_sampling/boundaries/fallen_shadow.py",
-        "edge.outline.is_behind(hit.n, ω, flush)",
+        "(at_foot | edge.outline.is_behind(hit.n, ω))",
         "edge.outline.is_behind(hit.n, ω)",
     ),
     mutant(

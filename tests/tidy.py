@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import mitsuba as mi
 import numpy as np
-from building import camera, constant, diffuse, mesh, quad, scene
+from building import camera, constant, diffuse, light, mesh, quad, scene
 from random_rooms import box, joined
 from random_scenes import ball
 
@@ -48,6 +48,20 @@ def dome() -> mi.Scene:
     bulb = {"type": "point", "position": [1.2, 2.5, -1.4], "intensity": 8.0}
     high = camera((0.3, 3.2, -1.3), (0.03, 0.13, 0.01), fov=24)
     return scene(sensor=high, floor=floor(), ball=thing, bulb=bulb, sky=constant(0.4))
+
+
+def cup() -> mi.Scene:
+    """An open cup on a floor, over which its walls lean, under a sky and a lamp that the walls hide in part from the
+    floor at their foot."""
+    angles, sides = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(16)
+    rings = [(r * np.cos(angles), np.full(16, y), r * np.sin(angles)) for r, y in ((0.15, 0.0), (0.35, 0.4))]
+    after = (sides + 1) % 16
+    faces = np.concatenate([np.stack(f, 1) for f in ((sides, sides + 16, after), (after, sides + 16, after + 16))])
+    points = np.add(np.concatenate([np.stack(ring, 1) for ring in rings]), [0.2, 0, -0.2])
+    thing = mesh("cup", points, faces, bsdf=diffuse(0.7, 0.3, 0.3, two_sided=True))
+    bulb = {"type": "sphere", "center": [1, 2, -1], "radius": 0.3, "emitter": light(9, 9, 8)}
+    view = camera((0.5, 1.4, -2.6), (0.2, 0.2, 0), fov=24)
+    return scene(sensor=view, floor=floor(), cup=thing, bulb=bulb, sky=constant(0.3))
 
 
 def stair() -> mi.Scene:
@@ -186,6 +200,7 @@ BOX = {"key": "box.vertex_positions", "direction": [1, 0, 0.4]}
 TIDY: dict[str, tuple[Callable[[], mi.Scene], dict, float]] = {
     "box_on_lines": (box_on_lines, CAMERA, 2e-3),
     "dome": (dome, CAMERA, 2e-3),
+    "cup": (cup, {"key": "cup.vertex_positions", "direction": [1, 0, 0]}, 2e-3),
     "stair": (stair, CAMERA, 2e-3),
     "shelf": (shelf, CAMERA, 2e-3),
     "can_on_box": (can_on_box, CAMERA, 2e-3),

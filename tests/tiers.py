@@ -30,8 +30,8 @@ MORE_CASES = (
     "pillar_turns strip_wall cut_bulb polished_camera polished_floor polished_rises fine_camera fine_look fine_wall "
     "rippled_mirror checkers_throw checkers_beside lamp_slides coarse_normals coarse_slides coarse_hill "
     "wall_in_water window_in_floor glass_in_floor coarse_veil coarse_behind_pane checkered_facets pictured_globe "
-    "shiny_leaf box_on_lines dome stair shelf can_on_box carpet box_in_lines box_on_corners steps books front_view "
-    "plan glass_plan inside_out mirror_throws mirror_throws_camera lamp_in_bulb"
+    "shiny_leaf box_on_lines dome cup stair shelf can_on_box carpet box_in_lines box_on_corners steps books "
+    "front_view plan glass_plan inside_out mirror_throws mirror_throws_camera lamp_in_bulb"
 )
 
 #: Slow tests, by how their names begin.

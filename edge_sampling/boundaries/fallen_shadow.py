@@ -112,9 +112,10 @@ def fall(scene: mi.Scene, light: LightPoint, edge: LitEdge) -> Shadow:
     if edge.outline is not None:
         slack = rounding(p, dr.select(far, p, light.y))
         on_edge = dr.abs_dot(hit.n, hit.p - p) <= slack
-        # What lies in that surface at the point itself throws no shadow on it: sides of boxes that stand flush.
-        flush = dr.norm(hit.p - p) <= FLUSH * slack
-        active &= ~(on_edge & edge.outline.is_behind(hit.n, ω, flush))
+        # What lies in that surface at the point itself throws no shadow on it there: sides of boxes that stand flush,
+        # and the foot of a wall.
+        at_foot = dr.norm(hit.p - p) <= FLUSH * slack
+        active &= ~(on_edge & (at_foot | edge.outline.is_behind(hit.n, ω)))
     facing = hit.n * -dr.sign(dr.dot(hit.n, ω))
     lift = dr.dot(spawn_ray(scene, hit, -ω).o - hit.p, facing)
     cos_x = -dr.dot(facing, ω)

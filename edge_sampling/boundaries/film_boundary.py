@@ -23,13 +23,19 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.first_points import FirstPoints
-from rimlight.edge_sampling.geometry.beside import are_edge_on, compare_depth, line_of_sight, rounding
+from rimlight.edge_sampling.geometry.beside import (
+    are_edge_on,
+    compare_depth,
+    line_of_sight,
+    rounding,
+)
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
 from rimlight.edge_sampling.geometry.surfaces import GOES_ON
 from rimlight.edge_sampling.lights import Lights
 from rimlight.edge_sampling.projection.sensors import Projection, inside_frame
 
+from .both_sides import Beside
 from .crease import Crease, Directions, LuneOrCrease
 from .film_outlines import Chosen, FilmOutlines, Found, Placed
 from .grid_outlines import on_grids
@@ -218,8 +224,11 @@ class FilmBoundary:
             look = partial(self._look, tracer, at, sensor)
             around = aside + reach
             beside, rest, n, n_dl, active = on_grids(outlines, at, look, chosen, found, u, p, n_dl, around, active)
-            rays, weights = _beside(at, sensor, sampler, beside, (aside + rest * reach) * n, active)
-            met = [tracer.first_hit(ray, active) for ray in rays]
+            pair, offset = Beside(tracer, at, sensor, beside, n, sampler), aside + rest * reach
+            looked = pair.at(offset, active)
+            if outlines.edges is not None:
+                looked = pair.clear_of_overhangs(p, offset, looked, active & chosen.is_edge)
+            rays, weights, met = looked
             before, sides = None, (rays, met)
             if self.veils:
                 slack = BENT * around / at.projection.pixels_per_unit(at.projection.film(p))
@@ -400,18 +409,3 @@ class FilmBoundary:
         per_unit = projection.pixels_per_unit(projection.film(p))
         on_film = ulps * max(projection.crop_size + projection.crop_offset)
         return (ulps * largest + farther) * per_unit + on_film, reach * per_unit
-
-
-def _beside(at: Placed, sensor: mi.Sensor, sampler: mi.Sampler, u, offset, active) -> tuple[list, list]:
-    """Rays at the positions u − offset and u + offset of the film, and their weights."""
-    time = sensor.shutter_open()
-    if sensor.shutter_open_time() > 0:
-        time += sampler.next_1d() * sensor.shutter_open_time()
-    wavelength_sample = sampler.next_1d() if mi.is_spectral else 0.0
-    lens = mi.Point2f(0.5) if at.aperture_sample is None else at.aperture_sample
-    on_film = lambda v: (v - at.projection.crop_offset) / at.projection.crop_size
-    made = [
-        sensor.sample_ray_differential(time, wavelength_sample, on_film(u + sign * offset), lens, active)
-        for sign in (-1, 1)
-    ]
-    return [ray for ray, _ in made], [weight for _, weight in made]

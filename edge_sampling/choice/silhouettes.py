@@ -94,15 +94,13 @@ class OutlinePoint:
         silhouettes runs back, so that with this sign it is as long as that of the surface."""
         return dr.select(self.concave, mi.Float(-1), 1)
 
-    def is_behind(self, n: mi.Vector3f, ω: mi.Vector3f, flush: mi.Bool | bool = False) -> mi.Bool:
+    def is_behind(self, n: mi.Vector3f, ω: mi.Vector3f) -> mi.Bool:
         """Do its faces lie behind a surface in which the point is? Then that hides the edge. Where shapes cut through
         each other, both go on in front of it.
 
-        n : normal of the surface. ω : from the viewer; both of unit length. flush : do faces that lie in the surface
-            count, too?
+        n : normal of the surface. ω : from the viewer; both of unit length.
         """
-        least = dr.select(flush, mi.Float(-RISES), RISES)
-        rises = [dr.mulsign(dr.dot(v, n), dr.dot(n, ω)) > least * dr.norm(v) for v in self.inwards]
+        rises = [dr.mulsign(dr.dot(v, n), dr.dot(n, ω)) > RISES * dr.norm(v) for v in self.inwards]
         return rises[0] & rises[1] & ~self.slides & ~self.is_line
 
 

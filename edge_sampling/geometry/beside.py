@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Sequence
+from functools import reduce
+
 import drjit as dr
 import mitsuba as mi
+
+from rimlight.edge_sampling.rays import lift, lift_beyond
 
 #: Faces are seen edge-on if the sine of the angle between them and the line of sight is at most so large.
 EDGE_ON = 1e-6
@@ -12,6 +18,10 @@ EDGE_ON = 1e-6
 #: the other surface overhangs, in units of the offset of rays that start there: the cotangent of the angle between
 #: both, beyond which rays start below it, but at most the second number.
 BESIDE_LINE = 1.25, 8
+
+#: And beside the edges of meshes that rays go through as if nothing was there, and lines in which such cut others, in
+#: units of the offset of such rays. (At these lines, over the sine of the angle between both.)
+BESIDE_MASK = 2
 
 
 def are_edge_on(n: mi.Vector3f, d: mi.Vector3f, least: float = EDGE_ON) -> mi.Bool:
@@ -34,6 +44,25 @@ def overhang(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
     cotangent = -dr.dot(first, second) / dr.norm(dr.cross(first, second))
     margin, most = BESIDE_LINE
     return dr.clip(margin * cotangent, 0, most)
+
+
+def clear_of_overhang(
+    scene: mi.Scene, p: mi.Point3f, rays: Sequence[mi.Ray3f], met: Sequence[mi.SurfaceInteraction3f]
+) -> mi.Float:
+    """How far beside a line in which two surfaces meet, at its point p, rays from one of them do not start below the
+    other one, as they would closer to it: scene units.
+
+    rays, met : on both sides of the line, and the surfaces.
+    """
+    n, m = (dr.mulsign(si.n, -dr.dot(si.n, ray.d)) for si, ray in zip(met, rays, strict=True))
+    flags = [si.bsdf().flags() for si in met]
+    either = lambda kind: mi.has_flag(flags[0], kind) | mi.has_flag(flags[1], kind)
+    ways_in = mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission, mi.BSDFFlags.DiffuseTransmission
+    goes_in = reduce(operator.or_, map(either, ways_in))
+    below = dr.maximum(overhang(n, m), dr.select(goes_in, overhang(n, -m), 0))
+    through = BESIDE_MASK / dr.maximum(dr.norm(dr.cross(n, m)), 1 / BESIDE_LINE[1])
+    beyond = dr.select(either(mi.BSDFFlags.Null), through * lift_beyond(scene, p), 0)
+    return below * lift(scene, p) + beyond
 
 
 def line_of_sight(p: mi.Point3f, rays: tuple[mi.Ray3f, mi.Ray3f]) -> mi.Vector3f:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rimlight.edge_sampling.rays import lift, lift_beyond
 
-from .beside import BESIDE_LINE, are_edge_on, beside_edge, compare_depth, overhang, passes, rounding
+from .beside import BESIDE_LINE, BESIDE_MASK, are_edge_on, beside_edge, compare_depth, overhang, passes, rounding
 from .edges import EdgeKind, Edges
 from .grid_edges import GridEdges
 from .meshes import Geometry, bends_light, lets_rays_through
@@ -19,10 +19,6 @@ COPLANAR = 1e-5
 #: How far beside the edges of glass to look, in units of the offset of rays that start there, times the cotangent of
 #: the angle between the faces: closer, rays through the mesh start beyond the other face.
 BEHIND = 8
-
-#: And beside those of meshes that rays go through as if nothing was there, and lines in which such cut others, in units
-#: of the offset of such rays. (At these lines, over the sine of the angle between both.)
-BESIDE_MASK = 2
 
 #: And beside sharp edges, in units of `beside_edge`, times the cotangent of the angle between the faces, but at most so
 #: large a cotangent. Closer, rays meet both faces at the same distance, up to rounding, often the one that faces away.

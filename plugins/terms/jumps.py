@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import operator
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
 from rimlight.edge_sampling.boundaries.shown_shadows import Border
 from rimlight.edge_sampling.boundaries.touch import Touch, touch_outline
-from rimlight.edge_sampling.geometry.beside import BESIDE_LINE, overhang, rounding
-from rimlight.edge_sampling.geometry.device_edges import BEHIND, BESIDE_MASK
+from rimlight.edge_sampling.geometry.beside import clear_of_overhang, rounding
+from rimlight.edge_sampling.geometry.device_edges import BEHIND
 from rimlight.edge_sampling.geometry.instances import surface_met
 from rimlight.edge_sampling.geometry.texture_lines import Line, TextureLines
-from rimlight.edge_sampling.rays import lift, lift_beyond
+from rimlight.edge_sampling.rays import lift
 from rimlight.transport.film_chains import Chains, Parting, Seen, Segment
 from rimlight.transport.paths import Vertex
 from rimlight.transport.ray_derivatives import change_of
@@ -208,15 +208,7 @@ def _beside_line(scene: mi.Scene, at: Parting, segment: Segment, p: mi.Point3f) 
     cosine = dr.maximum(dr.minimum(dr.abs_dot(a.n, at.a.ray.d), dr.abs_dot(b.n, at.b.ray.d)), STEEPEST)
     near = dr.norm(a.p - b.p) <= NEXT * apart / cosine + rounding(a.p, at.a.ray.o)
     meet = a.is_valid() & b.is_valid() & near
-    n, m = (dr.mulsign(si.n, -dr.dot(si.n, ray.d)) for si, ray in ((a, at.a.ray), (b, at.b.ray)))
-    flags = [si.bsdf().flags() for si in (a, b)]
-    either = lambda kind: mi.has_flag(flags[0], kind) | mi.has_flag(flags[1], kind)
-    ways_in = mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission, mi.BSDFFlags.DiffuseTransmission
-    goes_in = reduce(operator.or_, map(either, ways_in))
-    below = dr.maximum(overhang(n, m), dr.select(goes_in, overhang(n, -m), 0))
-    through = BESIDE_MASK / dr.maximum(dr.norm(dr.cross(n, m)), 1 / BESIDE_LINE[1])
-    beyond = dr.select(either(mi.BSDFFlags.Null), through * lift_beyond(scene, p), 0)
-    return dr.select(meet, below * lift(scene, p) + beyond, 0)
+    return dr.select(meet, clear_of_overhang(scene, p, (at.a.ray, at.b.ray), (a, b)), 0)
 
 
 def _goes_in(vertex: Vertex) -> mi.Bool:
