@@ -40,8 +40,8 @@ class Beside:
         return rays, weights, [self._tracer.first_hit(ray, active) for ray in rays]
 
     def clear_of_overhangs(self, p: mi.Point3f, aside: mi.Float, looked: Looked, active: mi.Bool) -> Looked:
-        """From farther aside, where both rays meet surfaces on which p lies, and one leans over the other, as at the foot
-        of a wall that leans outward: see `clear_of_overhang`.
+        """From farther aside, where both rays meet surfaces on which p lies, and one leans over the other: as at the
+        foot of a wall that leans outward. See `clear_of_overhang`.
 
         aside : from how far aside `looked` is, pixels.
         """
