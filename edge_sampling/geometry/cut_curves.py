@@ -123,7 +123,7 @@ class CutCurves:
         #: The pieces: of which pair and arc, and from which part of it to which.
         self._pairs = self._slot = self._start = self._end = None
         self.capacity = 0
-        #: Shapes that may be cut, by their numbers in `Geometry.moving`.
+        #: Shapes that may be cut, or could be before, by their numbers in `Geometry.moving`.
         self.shapes: tuple[int, ...] = ()
 
     # ---------------------- Search ----------------------
@@ -136,7 +136,7 @@ class CutCurves:
         overlap, before = _overlapping(geometry), (self.shapes, self.capacity)
         if overlap != self._overlap:
             self._overlap, self._candidates = overlap, self._make(geometry, overlap)
-        self.shapes = tuple(sorted({i for pair in overlap for i in pair}))
+        self.shapes = tuple(sorted({*self.shapes, *(i for pair in overlap for i in pair)}))
         lane, count = np.zeros(0, np.uint32), np.zeros(0, np.uint32)
         if overlap:
             with dr.suspend_grad():

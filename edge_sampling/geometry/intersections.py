@@ -94,7 +94,8 @@ class Intersections:
         #: Where the meshes were (held, so that the number of an array is given to no other one).
         self._at: list[mi.Float] | None = None
         self.count = self.capacity = 0
-        #: Meshes that may cut each other, since their boxes overlap: their numbers.
+        #: Meshes that may cut each other, since their boxes overlap, or did so before: their numbers. (So a thing that
+        #: goes up and down through a floor does not ask for other boundaries each time.)
         self.shapes: tuple[int, ...] = ()
         #: Six vertices of each pair of triangles, and two more, which are one and the same where the line is no edge:
         #: (capacity,) each.
@@ -121,7 +122,7 @@ class Intersections:
             alone = (self._forms.changed(arrays) | self._by_themselves) - grids
             everywhere = {i: np.array([[-np.inf] * 3, [np.inf] * 3]) for i in alone}
             self._search(scene, dr.detach(replace(geometry, lines=()).positions()), boxes | everywhere)
-        self.shapes = tuple(sorted(boxes.keys() | self._by_themselves))
+        self.shapes = tuple(sorted({*self.shapes, *boxes, *self._by_themselves}))
         return bool(self.capacity) and before != (self.shapes, self.capacity)
 
     def _search(self, scene: mi.Scene, positions: mi.Float, boxes: dict[int, np.ndarray]) -> None:
