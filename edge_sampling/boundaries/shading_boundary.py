@@ -218,8 +218,7 @@ class ShadingBoundary:
                 crease = self.silhouettes.crease(e, outline) * near
                 # The closer an edge is, the faster its direction turns; but behind a veil, as fast as that is close.
                 turn = dr.select(aimed, 1, dr.rsqrt(r2)) * self.silhouettes.preferred(e, use)
-                jumps = dr.select(seen_past | outline.crosses, 1, crease)
-                jumps = dr.select(outline.is_line, dr.select(seen_past, mi.Float(0), 1), jumps)
+                jumps = dr.select((seen_past ^ outline.is_line) | outline.crosses, 1, crease)
                 return e, dr.max(f) * arc * turn * dr.select(emitted | aim.counts(ω), jumps, 0)
 
             many = tracer.scatters(2) or tracer.lamps is not None
@@ -373,16 +372,15 @@ class ShadingBoundary:
         return L, active
 
     def _outward(self, outline, across, ω, n_dl, sampler, active) -> tuple[mi.Float, mi.Vector3f]:
-        """The side of an edge on which its faces are not, 1 or −1 along `across`; 0 if they are on both. And `n_dl`,
-        which is twice as large where one of two sides is looked at."""
+        """The side of an edge where its faces are not, ±1 along `across`; 0: both. And `n_dl`, for one of two sides."""
         outward = outline.outward(across, ω)
         if not self.silhouettes.lines:
             return outward, n_dl
         # Beside a line in which meshes cut through each other, both sides slide past it. One of them is looked at, by
         # chance. Where it is an edge that is a silhouette, that counts in its place.
         one = dr.select(sampler.next_1d(active) < 0.5, mi.Float(1), -1)
-        of_line = dr.select(outward == 0, 2 * n_dl, 0)
-        return dr.select(outline.is_line, one, outward), dr.select(outline.is_line, of_line, n_dl)
+        times = dr.select(outline.is_line, dr.select(outward == 0, mi.Float(2), 0), 1)
+        return dr.select(outline.is_line, one, outward), times * n_dl
 
     def _emitted(
         self, tracer, point, y, ω, pdf, distance, active, light: mi.EmitterPtr, found_too: mi.Bool

@@ -167,11 +167,12 @@ class DeviceEdges:
         of = lambda kind: dr.gather(mi.Bool, kind, edge)
         fold = of(self._two_faces) & ~self.is_silhouette(positions, edge, eye, view)
         covered = (covers[0] | covers[1]) & ~(shown[0] | shown[1])
-        hidden = dr.select(fold, ~(shown[0] & shown[1]) | self.rests(edge), covered)
+        hidden = dr.select(fold, ~(shown[0] & shown[1]), covered)
         hidden = dr.select(of(self._few_faces), hidden, ~reached)
         edge_on = [are_edge_on(n, rays[0].d) for n in normals]
         hidden |= (edge_on[0] | edge_on[1]) & (before | ~reached)
         if self._any_lines:
+            hidden |= fold & self.rests(edge)
             hidden_line = self._is_hidden_line(positions, edge, p, rays, met)
             hidden_line |= self._repeats_silhouette(positions, edge, eye, view)
             hidden = dr.select(of(self._is_line), hidden_line, hidden)
