@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from random_patterns import PatternGenerator
 from random_rooms import box
-from random_scenes import Generator, ball, quad
+from random_scenes import Generator, ball, grid, quad
 
 #: Height of the floor, and half of its width.
 FLOOR, HALF = -0.4, 3.0
@@ -27,9 +27,30 @@ ALONG = ((0, -1, 0), (1, -1, 0), (-1, -2, 0), (0, -1, -1), (0, -2, 1), (0, -1, -
 #: Half of the widths of things.
 HALVES = (0.25, 0.375, 0.5)
 
+GLASS = ("dielectric", "glass", "roughdielectric")
+
+#: Radii of cups at the foot and at the rim.
+RADII = ((0.6, 1.0), (0.4, 1.0), (1.0, 0.7))
+
+
+def cup(foot: float, rim: float) -> tuple[np.ndarray, ...]:
+    """Walls that lean, of height 2, open below and above."""
+
+    def point(φ, v):
+        r, across = foot + (rim - foot) * v, np.stack([np.cos(φ), np.sin(φ)], 1)
+        normal = np.concatenate([2 * across, np.full((len(φ), 1), foot - rim)], 1)
+        return np.column_stack([r[:, None] * across, 2 * v - 1]), normal / np.linalg.norm(normal, axis=1)[:, None]
+
+    return grid(point, 16, 2)
+
 
 class TidyGenerator(PatternGenerator):
     """Two or three things on a floor, in a row or in a stack, and perhaps a wall of mirror, glass or plaster."""
+
+    def __init__(self, seed: int, *args, **options):
+        super().__init__(seed, *args, **options)
+        #: Apart from `rng`: what came later does not change the rest of a scene.
+        self.later = np.random.default_rng([seed, 15])
 
     def bsdf(self, uv: bool = False, closed: bool = False) -> tuple[str, dict]:
         which = self.pick("plain", "plain", "mirror", "pattern")
@@ -109,19 +130,24 @@ class TidyGenerator(PatternGenerator):
         if place == "stack" and i and self.round_first:
             kind = "sphere"  # touches the first in a point, at most
         material, bsdf = self.bsdf(kind in ("box", "ball", "smooth"), kind != "cylinder")
-        if kind == "cylinder" and bsdf["type"] not in ("roughdielectric", "thindielectric", "mask"):
+        if self.later.random() < {"cylinder": 0.6, "cube": 0.6}.get(kind, 0) and bsdf["type"] not in GLASS:
+            kind = "cup"
+        if kind in ("cylinder", "cup") and bsdf["type"] not in ("roughdielectric", "thindielectric", "mask"):
             bsdf = self.two_sided(bsdf)
-        if material in ("dielectric", "glass", "roughdielectric", "trans"):
+        if material in (*GLASS, "trans"):
             base += 0.01  # else, what is seen in a face that lies on another one is a matter of rounding
         name, centre = f"thing{i}", np.array([x, base + half, z])
         if i == 0:
-            self.round_first = kind in ("sphere", "ball", "smooth", "cylinder")
+            self.round_first = kind in ("sphere", "ball", "smooth", "cylinder", "cup")
         key, how = f"{name}.vertex_positions", "slides"
         if kind == "box":
             made = self.mesh(name, box([-1, -1, -1], [1, 1, 1]), np.eye(3) * half, centre, bsdf)
-        elif kind in ("ball", "smooth"):
+        elif kind in ("ball", "smooth", "cup"):
             upright = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) * half
-            made = self.mesh(name, ball(self.pick(8, 12)), upright, centre, bsdf, smooth=kind == "smooth")
+            smooth, shape = kind == "smooth", None
+            if kind == "cup":
+                smooth, shape = bool(self.later.random() < 0.5), cup(*RADII[self.later.integers(len(RADII))])
+            made = self.mesh(name, shape or ball(self.pick(8, 12)), upright, centre, bsdf, smooth=smooth)
         else:
             linear = {"cube": np.eye(3), "sphere": np.eye(3)}.get(kind, np.array([[1, 0, 0], [0, 0, 2], [0, -1, 0]]))
             centre = centre - [0, half, 0] if kind == "cylinder" else centre
