@@ -53,10 +53,13 @@ class Beside:
         farther = touching & (clear > aside)
         again = self.at(clear, farther)
         farther, _ = self._meet_at(p, again[0], again[2], farther)
-        return tuple(
+        chosen = tuple(
             [dr.select(farther, there, here) for there, here in zip(*pair, strict=True)]
             for pair in zip(again, looked, strict=True)
         )
+        for new, ray in zip(chosen[0], rays, strict=True):
+            new.has_differentials = ray.has_differentials  # which `dr.select` forgets
+        return chosen
 
     @staticmethod
     def _meet_at(p: mi.Point3f, rays: list, met: list, active: mi.Bool) -> tuple[mi.Bool, list]:
