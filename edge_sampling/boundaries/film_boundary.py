@@ -23,12 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.first_points import FirstPoints
-from rimlight.edge_sampling.geometry.beside import (
-    are_edge_on,
-    compare_depth,
-    line_of_sight,
-    rounding,
-)
+from rimlight.edge_sampling.geometry.beside import are_edge_on, compare_depth, line_of_sight, rounding
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry, lets_rays_through
 from rimlight.edge_sampling.geometry.surfaces import GOES_ON

@@ -84,7 +84,7 @@ class Intersections:
         self._beside = lambda: _beside(geometry, edges, weld, faces)
         #: See there.
         self._beyond: mi.UInt32 | None = None
-        self._jumps: mi.Bool | None = None
+        self._always: mi.Bool | None = None
         self._first_mesh = first_meshes(geometry)
         self._in_group = numbers_in_groups(geometry) if tells_shapes_in_groups() else None
         counts = [m.face_count() for m in geometry.meshes]
@@ -179,7 +179,7 @@ class Intersections:
 
     def _sides_of(self, meshes: tuple[int, ...]) -> _Walked:
         if self._beyond is None:
-            self._beyond, self._jumps = self._beside()
+            self._beyond, self._always = self._beside()
         if meshes not in self._walked:
             mesh = np.repeat(np.arange(self._meshes), np.multiply(3, self._counts))
             side = np.flatnonzero(np.isin(mesh, meshes))
@@ -299,7 +299,7 @@ class Intersections:
             above = self._corners_of(dr.gather(mi.UInt32, self._beyond, 3 * face + k))[2]
             here = (dr.abs(height(a)) <= slack) & (dr.abs(height(b)) <= slack)
             here &= height(above) < -slack if below else height(above) > slack
-            here &= ~dr.gather(mi.Bool, self._jumps, 3 * face + k)
+            here &= ~dr.gather(mi.Bool, self._always, 3 * face + k)
             goes_on |= here
             side = dr.select(here, 3 * face + k, side)
         return goes_on, side
