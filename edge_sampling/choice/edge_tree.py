@@ -3,7 +3,7 @@
 Every node says where its edges are (a box), how long they are together, and how their planes lie: a face plane is
 written q = (n, d), so that with y = (p, −1) the sign of q·y tells on which side a point p is. An edge is a silhouette
 as seen from p where its two planes differ in that sign. A node keeps a box around its planes, which rejects, and their
-first two moments, from which the expected number of silhouettes follows (`edge_importance.py`).
+first two moments, from which the expected number of silhouettes follows (`importance.py`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from rimlight.edge_sampling.geometry.device_edges import DeviceEdges
 from rimlight.edge_sampling.geometry.edges import Edges
 from rimlight.edge_sampling.geometry.meshes import Geometry
 
-#: Edges of a leaf. They are tested one by one.
-LEAF = 8
+from .edge_order import LEAF, order, pieces
 
 
 @dataclass
@@ -74,8 +73,8 @@ NODE_PACKETS, SLOT_PACKETS = 11, 4
 
 @dataclass
 class Slot:
-    """An edge in a leaf: end points relative to the centre of the tree, its two planes; 1 if it is always a boundary, 0
-    if as a silhouette only; and 1 if it is a crease, see `Node`."""
+    """An edge in a leaf, or a piece of one: end points relative to the centre of the tree, its two planes; 1 if it is
+    always a boundary, 0 if as a silhouette only; and 1 if it is a crease, see `Node`."""
 
     a: mi.Vector3f
     b: mi.Vector3f
@@ -94,11 +93,10 @@ class Slot:
 
 
 class EdgeTree:
-    """Complete binary trees over groups of edges, one beside the other in flat arrays.
+    """Binary trees over groups of edges, in flat arrays: inner nodes first, level by level, then leaves.
 
-    The order of the edges in the leaves is found once, by halving each node at the median along its longest side; it
-    stays good enough while a shape moves or deforms moderately. All else is computed from the vertex positions by
-    `refit`, level by level on the device.
+    The order of the edges in the leaves is found once, see `order`; it stays good enough while a shape moves or deforms
+    moderately. All else is computed from the vertex positions by `refit`, level by level on the device.
 
     Parameters
     ----------
@@ -106,11 +104,17 @@ class EdgeTree:
     edges : their edges, on the host.
     groups : indices into `edges`, a tree for each; without the empty ones.
     always : (E,), bool, which edges count from wherever they are seen, besides open ones; None: no others.
+
+    Attributes
+    ----------
+    roots : mi.UInt32 each, the root of each tree.
+    inner : mi.UInt32, number of inner nodes. is_deep : are there any? leaves : number of leaves.
+    slot_edge : mi.UInt32, of which edge each slot of a leaf holds a piece.
     """
 
-    _NUMBERS = ("leaf_size", "leaves", "bottoms", "device_node_offsets", "device_leaf_offsets")
+    _NUMBERS = ("roots", "inner", "is_deep", "leaves", "_children", "_first", "_levels")
     DRJIT_STRUCT = dict.fromkeys(  # for `dr.freeze`
-        ("device_edges", "centre", "slot_edge", "_used", "_open", "nodes", "slots", *_NUMBERS)
+        ("device_edges", "centre", "slot_edge", "_part", "_open", "nodes", "slots", *_NUMBERS)
     )
 
     def __init__(self, geometry: Geometry, edges: Edges, groups: list[np.ndarray], always: np.ndarray | None = None):
@@ -119,49 +123,57 @@ class EdgeTree:
         position = geometry.host_positions()
         ends = position[edges.vertices[:, 0]]
         ends = np.where(np.isfinite(ends), ends, 0)
-        centres = ends[:, 0] + edges.part[:, 0].mean(1, keepdims=True) * (ends[:, 1] - ends[:, 0])
-        # Opaque, like the offsets below: scenes that differ in numbers only share their kernels.
+        ends = ends[:, :1] + edges.part[:, 0, :, None] * (ends[:, 1:] - ends[:, :1])
+        # Where shapes cut through each other, the lines are numbered anew at each place: what is long does not stay so.
+        edge, part = pieces(np.where(edges.is_line, 0, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)))
+        centres = ends[edge, 0] + part.mean(1, keepdims=True) * (ends[edge, 1] - ends[edge, 0])
+        # Opaque, like what follows: scenes that differ in numbers only share their kernels.
         self.centre = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in np.median(centres, axis=0)))
-        slots, self.leaves, leaf_size = [], [], 0
-        self.node_offsets, self.leaf_offsets = [0], [0]
-        for group in groups:
-            order = _order(centres[group])
-            slots.append(np.where(order < 0, -1, group[order]))
-            leaves = len(order)
-            leaf_size = max(leaf_size, int((order >= 0).sum(1).max()))
-            self.leaves.append(leaves)
-            self.node_offsets.append(self.node_offsets[-1] + 2 * leaves)
-            self.leaf_offsets.append(self.leaf_offsets[-1] + leaves)
-        opaque = lambda numbers: [dr.opaque(mi.UInt32, x) for x in numbers]
-        self.leaf_size = dr.opaque(mi.UInt32, leaf_size)
-        self.bottoms = opaque(self.leaves)
-        self.device_node_offsets, self.device_leaf_offsets = map(opaque, (self.node_offsets, self.leaf_offsets))
-        slot = np.concatenate(slots).reshape(-1)
-        self.slot_edge = mi.UInt32(np.maximum(slot, 0).astype(np.uint32))
-        self._used = mi.Bool(slot >= 0)
+        tree = order(centres, [np.flatnonzero(np.isin(edge, g)) for g in groups], edges.is_line[edge])
+        self.leaves, inner = tree.leaves, len(tree.children)
+        self.roots = [dr.opaque(mi.UInt32, int(n)) for n in tree.roots]
+        self.inner, self.is_deep = dr.opaque(mi.UInt32, inner), inner > 0
+        index = lambda a: mi.UInt32(np.ascontiguousarray(a, np.uint32))
+        self._children = index(tree.children.ravel() if inner else [0, 0])  # Dr.Jit 1.5 cannot freeze empty arrays
+        self._first, self._levels = index(tree.first), tree.levels
+        self.slot_edge = index(edge[tree.items])
+        #: From where to where on its edge a slot extends; None: no edge is in pieces.
+        self._part = [mi.Float(end.copy()) for end in part[tree.items].T] if len(edge) > len(edges) else None
         always = edges.count != 2 if always is None else (edges.count != 2) | always
-        self._open = mi.Bool(always[np.maximum(slot, 0)])
+        self._open = mi.Bool(always[edge[tree.items]])
         #: An array for each packet: several scatters to one array would be as many kernels.
-        self.nodes = _zeros(NODE_PACKETS, self.node_offsets[-1])
-        self.slots = _zeros(SLOT_PACKETS, self.leaf_offsets[-1] * LEAF)
+        self.nodes = _zeros(NODE_PACKETS, inner + tree.leaves)
+        self.slots = _zeros(SLOT_PACKETS, len(tree.items))
         # Of the time that the refit of a small tree takes, 95 % are for tracing the same program again.
         self._recorded = dr.freeze(EdgeTree._fitted)
 
     @property
     def bytes(self) -> int:
         """Memory of the tree on the device, without the edges that it is over."""
-        words = sum(dr.width(a) for a in (*self.nodes, *self.slots, self.slot_edge))
-        return 4 * words + 2 * dr.width(self._used)
-
-    # ---------------------- Access ----------------------
+        words = [*self.nodes, *self.slots, self.slot_edge, self._children, self._first, *(self._part or ())]
+        return 4 * sum(map(dr.width, words)) + dr.width(self._open)
 
     def node(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Node:
-        """Nodes by their number in all trees together. Of tree k, the root is number `node_offsets[k]` + 1; children
-        of its node i are 2i and 2i + 1."""
+        """Nodes by their number in all trees together."""
         return Node.unpack(_gather(self.nodes, index, active))
+
+    def children(self, node: mi.UInt32, active: mi.Bool | bool = True) -> mi.Vector2u:
+        """Of inner nodes, the numbers of both."""
+        return dr.gather(mi.Vector2u, self._children, node, active)
+
+    def slots_of(self, node: mi.UInt32, active: mi.Bool | bool = True) -> tuple[mi.UInt32, mi.UInt32]:
+        """The first slot of a leaf, and how many it has."""
+        first, end = (dr.gather(mi.UInt32, self._first, node - self.inner + k, active) for k in (0, 1))
+        return first, end - first
 
     def slot(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Slot:
         return Slot.unpack(_gather(self.slots, index, active))
+
+    def part(self, slot: mi.UInt32, active: mi.Bool | bool = True) -> tuple[mi.Float, mi.Float]:
+        """From where to where on its edge a slot extends: 0 and 1, unless that is in pieces."""
+        if self._part is None:
+            return mi.Float(0), mi.Float(1)
+        return tuple(dr.gather(mi.Float, end, slot, active) for end in self._part)
 
     # ---------------------- Refit ----------------------
 
@@ -178,33 +190,31 @@ class EdgeTree:
     def _fitted(self, positions: mi.Float) -> tuple[list[mi.Float], list[mi.Float]]:
         """Nodes and slots for these positions."""
         with dr.suspend_grad():
-            slot = dr.arange(mi.UInt32, dr.width(self.slot_edge))
-            slots = _packed(self._slots_of(positions, slot))
-            levels: list[list[mi.Float]] = []
-            for leaves, first in zip(self.leaves, self.leaf_offsets, strict=False):
-                levels += self._levels(slots, leaves, first)
+            slots = _packed(self._slots_of(positions))
+            leaves = _packed(self._leaf(slots, self.inner + dr.arange(mi.UInt32, self.leaves)))
+            # Each level is an array of its own: Dr.Jit would copy one that has all of them before it writes each next
+            # level. Opaque offsets: all levels share one kernel.
+            levels, end = [leaves], sum(self._levels)
+            for count in reversed(self._levels):
+                begin = end - count
+                children = self.children(dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, begin))
+                nodes = [self._below(c, levels[0], dr.opaque(mi.UInt32, end), leaves) for c in children]
+                levels.insert(0, _packed(_merge(*nodes)))
+                end = begin
             return [dr.concat(list(packets)) for packets in zip(*levels, strict=True)], slots
 
-    def _levels(self, slots: list[mi.Float], leaves: int, first: int) -> list[list[mi.Float]]:
-        """The nodes of one tree, from the first level to the leaves. Each level is an array of its own: Dr.Jit would
-        copy one that has all of them before it writes each next level."""
-        # Opaque offsets: all levels share one kernel.
-        below = _packed(self._leaf(slots, LEAF * (dr.arange(mi.UInt32, leaves) + dr.opaque(mi.UInt32, first))))
-        levels, start = [below], leaves
-        for level in reversed(range((leaves - 1).bit_length())):
-            begin, end = 2**level, min(2 ** (level + 1), leaves)
-            child = 2 * dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, 2 * begin - start)
-            merged = _packed(_merge(*(Node.unpack(_gather(below, child + k)) for k in (0, 1))))
-            levels.insert(0, merged)
-            # Of the last level but one, the rest are leaves.
-            below = merged if end == 2 * begin else [dr.concat(list(p)) for p in zip(merged, below, strict=True)]
-            start = begin
-        return [_zeros(NODE_PACKETS, 1), *levels]
+    def _below(self, child: mi.UInt32, level: list[mi.Float], first: mi.UInt32, leaves: list[mi.Float]) -> Node:
+        """Nodes of the level that begins with number `first`, or leaves."""
+        is_leaf = child >= self.inner
+        of_level, of_leaves = _gather(level, child - first, ~is_leaf), _gather(leaves, child - self.inner, is_leaf)
+        return Node.unpack([dr.select(is_leaf, p, q) for p, q in zip(of_leaves, of_level, strict=True)])
 
-    def _slots_of(self, positions: mi.Float, slot: mi.UInt32) -> Slot:
+    def _slots_of(self, positions: mi.Float) -> Slot:
         device_edges = self.device_edges
         edge = self.slot_edge
         a, b = device_edges.end_points(positions, edge)
+        if self._part is not None:
+            a, b = (dr.lerp(a, b, end) for end in self._part)
         m = device_edges.normals(positions, edge)
         lengths = [dr.norm(n) for n in m]
         flat = [dr.select(length > 0, n / length, 0) for n, length in zip(m, lengths, strict=True)]
@@ -216,14 +226,15 @@ class EdgeTree:
         # What is always a boundary has no planes, but signs that always differ.
         for k, d in ((0, -1), (1, 1)):
             planes[k] = dr.select(always, mi.Vector4f(0, 0, 0, d), planes[k])
-        usable = self._used & dr.isfinite(dr.squared_norm(a)) & dr.isfinite(dr.squared_norm(b))
+        usable = dr.isfinite(dr.squared_norm(a)) & dr.isfinite(dr.squared_norm(b))
         a, b = dr.select(usable, a, 0), dr.select(usable, b, 0)
         crease = device_edges.crease(edge, dr.norm(dr.cross(flat[0], flat[1])))
         crease = dr.select(usable & ~always, crease, 0)
         return Slot(a, b, tuple(dr.select(usable, q, 0) for q in planes), mi.Float(always & usable), crease)
 
-    def _leaf(self, slots: list[mi.Float], first: mi.UInt32) -> Node:
-        nodes = [self._single(Slot.unpack(_gather(slots, first + k))) for k in range(LEAF)]
+    def _leaf(self, slots: list[mi.Float], node: mi.UInt32) -> Node:
+        first, count = self.slots_of(node)
+        nodes = [self._single(Slot.unpack(_gather(slots, first + k, k < count))) for k in range(LEAF)]
         while len(nodes) > 1:
             nodes = [_merge(p, q) for p, q in zip(nodes[::2], nodes[1::2], strict=True)]
         return nodes[0]
@@ -291,51 +302,3 @@ def _packed(what: Node | Slot) -> list[mi.Float]:
     packed = [dr.ravel(packet) for packet in what.pack()]
     dr.eval(packed)
     return packed
-
-
-# ---------------------- Order ----------------------
-
-
-def _order(centres: np.ndarray) -> np.ndarray:
-    """Edges of each leaf: (leaves, LEAF), indices into `centres`, -1 for none. Leaf k is node number `leaves` + k."""
-    n = len(centres)
-    leaves = -(-n // LEAF)
-    size = -(-n // leaves)
-    order = np.full(leaves * size, -1)
-    order[:n] = np.arange(n)
-    # What fills up sorts to the end.
-    padded = np.concatenate([centres, np.full((1, 3), np.nan)]).astype(np.float32)
-    order = _from_left_to_right(padded, order[None], leaves)
-    # Leaves of the last level come after those of the last level but one.
-    order = np.roll(order.reshape(leaves, size), -_in_last_level(leaves), axis=0)
-    return np.concatenate([order, np.full((leaves, LEAF - size), -1)], axis=1)
-
-
-def _from_left_to_right(centres: np.ndarray, order: np.ndarray, leaves: int) -> np.ndarray:
-    """Halve sets of edges until they are leaves, and return these from left to right: of (sets, edges), in so many
-    leaves each, (sets * leaves, edges of a leaf)."""
-    while leaves > 1:
-        half = 1 << (leaves - 1).bit_length() - 1
-        left = (half + min(_in_last_level(leaves), half)) // 2
-        where = left * (order.shape[1] // leaves)
-        order = _parted(centres, order, where)
-        if 2 * left != leaves:
-            sides = (order[:, :where], left), (order[:, where:], leaves - left)
-            return np.concatenate([_from_left_to_right(centres, *side) for side in sides])
-        order, leaves = order.reshape(2 * len(order), -1), left
-    return order
-
-
-def _parted(centres: np.ndarray, order: np.ndarray, where: int) -> np.ndarray:
-    """Each set of edges, such that no edge before `where` is beyond one after it, along its longest side."""
-    c = centres[order]
-    with np.errstate(invalid="ignore"):
-        extent = np.fmax.reduce(c, axis=1) - np.fmin.reduce(c, axis=1)
-    axis = np.nan_to_num(extent, nan=-1.0).argmax(1)
-    key = np.take_along_axis(c, axis[:, None, None], axis=2)[..., 0]
-    return np.take_along_axis(order, np.argpartition(key, where, axis=1), axis=1)
-
-
-def _in_last_level(leaves: int) -> int:
-    """How many of the leaves of a complete tree are in its last level."""
-    return 2 * leaves - (1 << (leaves - 1).bit_length())

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .edge_tree import LEAF, EdgeTree
+from .edge_tree import EdgeTree
 from .importance import edge_importance, importance
 from .on_edge import sample_point
 from .views import View
@@ -47,7 +47,7 @@ def sample_edge(
     EdgeSample, (N,)
     """
     descent = _choose_group(tree, view, use, mi.Float(choice), mi.Bool(active))
-    if max(tree.leaves) > 1:
+    if tree.is_deep:
         descent = _down_to_a_leaf(tree, view, descent, sampler)
     return _edge_of_the_leaf(tree, view, descent, sampler)
 
@@ -56,46 +56,39 @@ def sample_edge(
 class _Descent:
     """A way down a tree. (A Dr.Jit structure: the state of a loop.)
 
-    node : within its own tree. density : probability of the choices so far.
+    node : its number. density : probability of the choices so far.
     choice : uniform in [0, 1); what is left of a random number after each choice is uniform again.
     alive : does anything down there count?
-    bottom : number of the first leaf of this tree. node_offset, leaf_offset : of this tree, among all.
     """
 
     node: mi.UInt32
     density: mi.Float
     choice: mi.Float
     alive: mi.Bool
-    bottom: mi.UInt32
-    node_offset: mi.UInt32
-    leaf_offset: mi.UInt32
 
 
 def _choose_group(tree: EdgeTree, view: View, use, choice: mi.Float, active: mi.Bool) -> _Descent:
     """The root of one of the trees."""
-    density, total = mi.Float(1), mi.Float(0)
-    bottom, node_offset, leaf_offset = mi.UInt32(1), mi.UInt32(0), mi.UInt32(0)
-    for k, preference in enumerate(use):
+    density, total, node = mi.Float(1), mi.Float(0), mi.UInt32(0)
+    for root, preference in zip(tree.roots, use, strict=True):
         weight = mi.Float(preference)
         # A few edges are tested faster than their node.
-        if len(use) > 1 and max(tree.leaves) > 1:
-            weight *= importance(tree.node(tree.device_node_offsets[k] + 1), view)
+        if len(use) > 1 and tree.is_deep:
+            weight *= importance(tree.node(root), view)
         total += weight
         p = dr.select(total > 0, weight / total, 0)
         taken = choice < p
         choice = dr.select(taken, choice / p, (choice - p) / (1 - p))
         density = dr.select(taken, p, density * (1 - p))
-        bottom = dr.select(taken, tree.bottoms[k], bottom)
-        node_offset = dr.select(taken, tree.device_node_offsets[k], node_offset)
-        leaf_offset = dr.select(taken, tree.device_leaf_offsets[k], leaf_offset)
-    root = dr.full(mi.UInt32, 1, dr.width(view.p))
-    return _Descent(root, density, choice, active & (total > 0), bottom, node_offset, leaf_offset)
+        node = dr.select(taken, root, node)
+    node += dr.zeros(mi.UInt32, dr.width(view.p))
+    return _Descent(node, density, choice, active & (total > 0))
 
 
 def _down_to_a_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler) -> _Descent:
     def down(node, density, choice, alive, sampler):
-        child = 2 * node
-        weights = [importance(tree.node(child + k + at.node_offset, alive), view) for k in (0, 1)]
+        children = tree.children(node, alive)
+        weights = [importance(tree.node(child, alive), view) for child in children]
         total = weights[0] + weights[1]
         alive &= total > 0
         choice = _renewed(choice, density, sampler, alive)
@@ -103,12 +96,12 @@ def _down_to_a_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sample
         left = choice < p
         choice = dr.select(left, choice / p, (choice - p) / (1 - p))
         density = dr.select(alive, density * dr.select(left, p, 1 - p), 0)
-        node = dr.select(alive, child + dr.select(left, mi.UInt32(0), mi.UInt32(1)), node)
+        node = dr.select(alive, dr.select(left, *children), node)
         return node, density, choice, alive, sampler
 
     node, density, choice, alive, _ = dr.while_loop(
         (at.node, at.density, at.choice, at.alive, sampler),
-        lambda n, d, c, a, s: a & (n < at.bottom),
+        lambda n, d, c, a, s: a & (n < tree.inner),
         down,
         label="edge tree",
     )
@@ -118,7 +111,7 @@ def _down_to_a_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sample
 def _edge_of_the_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Sampler) -> EdgeSample:
     width, alive = dr.width(view.p), at.alive
     choice = _renewed(at.choice, at.density, sampler, alive)
-    first = (at.node - at.bottom + at.leaf_offset) * LEAF
+    first, count = tree.slots_of(at.node, alive)
 
     def test(k, total, chosen, weight, choice):
         slot = tree.slot(first + k, alive)
@@ -132,7 +125,7 @@ def _edge_of_the_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Samp
     state = (dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width), dr.zeros(mi.UInt32, width))
     _, total, chosen, weight, choice = dr.while_loop(
         (*state, dr.zeros(mi.Float, width), choice),
-        lambda k, *_: alive & (k < tree.leaf_size),
+        lambda k, *_: alive & (k < count),
         test,
         label="edges of a leaf",
     )
@@ -140,8 +133,10 @@ def _edge_of_the_leaf(tree: EdgeTree, view: View, at: _Descent, sampler: mi.Samp
     slot = first + chosen
     which = sampler.next_1d(alive) if view.lobes else mi.Float(0)
     t, pdf = sample_point(tree.slot(slot, alive), view, which, choice)
-    density = dr.select(alive, at.density * weight / total * pdf, 0)
-    return EdgeSample(dr.gather(mi.UInt32, tree.slot_edge, slot, alive), t, dr.select(dr.isfinite(density), density, 0))
+    start, end = tree.part(slot, alive)
+    density = dr.select(alive, at.density * weight / total * pdf / (end - start), 0)
+    edge, t = dr.gather(mi.UInt32, tree.slot_edge, slot, alive), dr.lerp(start, end, t)
+    return EdgeSample(edge, t, dr.select(dr.isfinite(density), density, 0))
 
 
 @dataclass

@@ -172,7 +172,7 @@ class Silhouettes:
     @property
     def leaves(self) -> int:
         """Number of leaves of the trees over the edges."""
-        return self.tree.leaf_offsets[-1] if self.tree is not None else 0
+        return self.tree.leaves if self.tree is not None else 0
 
     def refit(self) -> None:
         """Follow the vertices. To be called before sampling."""

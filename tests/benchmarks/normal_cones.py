@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from rimlight.edge_sampling.choice import sampling
-from rimlight.edge_sampling.choice.edge_tree import LEAF, EdgeTree, Node, Slot
+from rimlight.edge_sampling.choice.edge_tree import EdgeTree, Node, Slot
 from rimlight.edge_sampling.choice.importance import importance
 from rimlight.edge_sampling.choice.views import View
 
@@ -50,19 +50,21 @@ def replacements() -> list[tuple[Any, str, Any]]:
 
 def cones(tree: EdgeTree) -> np.ndarray:
     """(nodes, 4): around the face normals of each node, a unit vector and the largest angle to it, radians."""
-    p, q, a, b = (np.array(packet, float).reshape(-1, 4)[:, :3] for packet in tree.slots)
-    normals = np.stack([p, q], 1) * (a != b).any(1)[:, None, None]  # zero in slots without an edge
-    found = np.zeros((tree.node_offsets[-1], 4), np.float32)
-    for leaves, first, leaf in zip(tree.leaves, tree.node_offsets, tree.leaf_offsets, strict=False):
-        below = dict(enumerate(normals[leaf * LEAF :][: leaves * LEAF].reshape(leaves, -1, 3), start=leaves))
-        for node in reversed(range(1, 2 * leaves)):
-            if node < leaves:
-                below[node] = np.concatenate([below.pop(2 * node), below.pop(2 * node + 1)])
-            n = below[node]
-            axis = n.sum(0)
-            axis /= max(np.linalg.norm(axis), 1e-9)
-            cosine = np.where(n.any(1), n @ axis, 1).min()
-            found[first + node] = *axis, np.arccos(np.clip(cosine, -1, 1))
+    p, q = (np.array(packet, float).reshape(-1, 4)[:, :3] for packet in tree.slots[:2])
+    normals, inner = np.stack([p, q], 1), tree.inner[0]
+    first, count = map(np.array, tree.slots_of(dr.arange(mi.UInt32, tree.leaves) + tree.inner))
+    below = {inner + k: normals[i : i + n].reshape(-1, 3) for k, (i, n) in enumerate(zip(first, count, strict=True))}
+    children = np.array(tree.children(dr.arange(mi.UInt32, max(inner, 1)))).T
+    found = np.zeros((inner + tree.leaves, 4), np.float32)
+    # Children have larger numbers.
+    for node in reversed(range(len(found))):
+        if node < inner:
+            below[node] = np.concatenate([below[child] for child in children[node]])
+        n = below[node]
+        axis = n.sum(0)
+        axis /= max(np.linalg.norm(axis), 1e-9)
+        cosine = np.where(n.any(1), n @ axis, 1).min()
+        found[node] = *axis, np.arccos(np.clip(cosine, -1, 1))
     return found
 
 
