@@ -177,6 +177,19 @@ def thrown(v: mi.Vector3f, light: LightPoint, edge: LitEdge, shadow: Shadow) -> 
     return s * (v - d * (dr.dot(facing, v) / dr.dot(facing, d)))
 
 
+def across_border(
+    projection: Projection, light: LightPoint, edge: LitEdge, shadow: Shadow, view: SeenShadow
+) -> mi.Vector2f:
+    """The direction on the film across the border of a shadow, away from what is lit, as long as `edge.tangent` is on
+    the film once it is thrown like the shadow: pixels. Detached."""
+    on_film = lambda v: dr.detach(
+        projection.tangent(shadow.x, mi.Point3f(shadow.x + v), mi.Float(0), view.aperture_sample)
+    )
+    tangent, towards_light = (on_film(thrown(v, light, edge, shadow)) for v in (edge.tangent, edge.lit))
+    n = mi.Vector2f(-tangent.y, tangent.x)
+    return dr.mulsign(n, -dr.dot(n, towards_light))
+
+
 def on_both_sides(
     tracer: Tracer, projection: Projection, sensor: mi.Sensor, view: SeenShadow, shadow: Shadow, n, active
 ) -> mi.Bool:

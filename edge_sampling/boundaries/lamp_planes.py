@@ -27,7 +27,7 @@ from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.projection.sensors import Projection
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
-from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow, fall, look, thrown
+from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow, across_border, fall, look
 from .fine_mirrors import fringe
 from .shadow_boundary import ShadowSamples
 from .tracer import Tracer
@@ -85,12 +85,8 @@ class LampPlanes:
 
             # ---------------------- The boundary on the film ----------------------
 
-            on_film = lambda v: dr.detach(
-                projection.tangent(shadow.x, mi.Point3f(shadow.x + v), mi.Float(0), view.aperture_sample)
-            )
-            tangent, towards_light = (on_film(thrown(v, light, edge, shadow)) for v in (edge.tangent, edge.lit))
-            n_dl = mi.Vector2f(-tangent.y, tangent.x) * (dr.two_pi / (light.density * count))
-            n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light))
+            across = across_border(projection, light, edge, shadow, view)
+            n_dl = across * (dr.two_pi / (light.density * count))
             active = view.active & dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             n_dl, u = dr.select(active, n_dl, 0), dr.select(active, view.u, 0)
             # The direction, in parts of the two sides of the face with which it moves.

@@ -33,7 +33,7 @@ from rimlight.edge_sampling.parametrisation import material_point
 from rimlight.edge_sampling.projection.sensors import Projection
 from rimlight.edge_sampling.smooth_lamps import SmoothLamps
 
-from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow, fall, look, on_both_sides, thrown
+from .fallen_shadow import LightPoint, LitEdge, SeenShadow, Shadow, across_border, fall, look, on_both_sides
 from .near_lamps import moved_with, share_at_first, still_on_film
 from .tracer import Tracer
 
@@ -131,14 +131,8 @@ class ShadowBoundary:
 
             # ---------------------- The boundary on the film ----------------------
 
-            on_film = lambda v: projection.tangent(
-                shadow.x, mi.Point3f(shadow.x + v), mi.Float(0), view.aperture_sample
-            )
-            tangent, towards_light = (
-                dr.detach(on_film(thrown(v, light, edge, shadow))) for v in (edge.tangent, edge.lit)
-            )
-            n_dl = mi.Vector2f(-tangent.y, tangent.x) / (edge.sample.density * light.density * (count / len(self)))
-            n_dl = dr.mulsign(n_dl, -dr.dot(n_dl, towards_light)) * edge.sign
+            across = across_border(projection, light, edge, shadow, view)
+            n_dl = across * edge.sign / (edge.sample.density * light.density * (count / len(self)))
             active &= dr.isfinite(dr.squared_norm(n_dl)) & dr.any(jump != 0)
             active &= on_both_sides(tracer, projection, sensor, view, shadow, n_dl, active)
             n_dl = dr.select(active, n_dl, 0)
