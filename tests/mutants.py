@@ -606,6 +606,12 @@ MUTANTS = [
         "farther = mi.Bool(False)",
     ),
     mutant(
+        "edges from points: what leans over its foot darkens what it stands on",
+        "edge_sampling/boundaries/shading_boundary.py",
+        "farther, aside = clear > aside, dr.maximum(clear, aside)",
+        "farther = mi.Bool(False)",
+    ),
+    mutant(
         "shadows from lights: sides of boxes that stand flush throw shadows on each other",
         "edge_sampling/boundaries/fallen_shadow.py",
         "(at_foot | edge.outline.is_behind(hit.n, ω))",

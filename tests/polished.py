@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 from building import CUBE_FACES, camera, constant, cube_vertices, diffuse, horizontal, light, mesh, quad, scene
 from random_scenes import ball
+from tidy import open_cup
 
 
 def metal(alpha: float) -> dict:
@@ -89,7 +90,21 @@ def balls() -> mi.Scene:
     )
 
 
+def cup_in_metal() -> mi.Scene:
+    """A cup on a floor, seen in a wall of polished metal: its walls lean over its foot."""
+    bulb = {"type": "sphere", "center": [1, 2.5, -1.3], "radius": 0.3, "emitter": light(9, 9, 8)}
+    return scene(
+        sensor=camera((0, 0.8, 0.5), (0.17, 0.42, 2.8), fov=15),
+        cup=open_cup((0.2, 0, -1.2), turned=0.11),
+        floor=horizontal((0, 0, 0), 3, "floor", bsdf=diffuse(0.6, 0.5, 0.4, two_sided=True)),
+        wall=quad((-1.5, -0.5, 1.5), (3, 0, 0), (0, 2.5, 0), "wall", bsdf=metal(0.006)),
+        bulb=bulb,
+        sky=constant(0.3),
+    )
+
+
 CAMERA_ALONG = {"key": "sensor.to_world", "direction": [1, 0, 0]}
+CUP_SLIDES = {"key": "cup.vertex_positions", "direction": [1, 0, 0.3]}
 CAMERA_TURNS = {"key": "sensor.to_world", "rotate": [0, 1, 0]}
 FLOOR_RISES = {"key": "floor.vertex_positions", "direction": [0, 1, 0]}
 FLOOR_TILTS = {"key": "floor.vertex_positions", "rotate": [0.2, 0, 1]}
@@ -112,4 +127,5 @@ POLISHED = {
     "polished_sphere": (balls, SPHERE_SLIDES, 4e-3, 2),
     "polished_figure": (balls, FIGURE_SLIDES, 4e-3, 2),
     "balls_camera": (balls, CAMERA_ALONG, 4e-3, 3),
+    "cup_in_metal": (cup_in_metal, CUP_SLIDES, 5e-3, 3),
 }

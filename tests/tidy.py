@@ -50,18 +50,21 @@ def dome() -> mi.Scene:
     return scene(sensor=high, floor=floor(), ball=thing, bulb=bulb, sky=constant(0.4))
 
 
-def cup() -> mi.Scene:
-    """An open cup on a floor, over which its walls lean, under a sky and a lamp that the walls hide in part from the
-    floor at their foot."""
-    angles, sides = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(16)
+def open_cup(at: tuple, turned: float = 0.0) -> mi.Mesh:
+    """Its walls lean over what it stands on."""
+    angles, sides = np.linspace(0, 2 * np.pi, 16, endpoint=False) + turned, np.arange(16)
     rings = [(r * np.cos(angles), np.full(16, y), r * np.sin(angles)) for r, y in ((0.15, 0.0), (0.35, 0.4))]
     after = (sides + 1) % 16
     faces = np.concatenate([np.stack(f, 1) for f in ((sides, sides + 16, after), (after, sides + 16, after + 16))])
-    points = np.add(np.concatenate([np.stack(ring, 1) for ring in rings]), [0.2, 0, -0.2])
-    thing = mesh("cup", points, faces, bsdf=diffuse(0.7, 0.3, 0.3, two_sided=True))
+    points = np.add(np.concatenate([np.stack(ring, 1) for ring in rings]), at)
+    return mesh("cup", points, faces, bsdf=diffuse(0.7, 0.3, 0.3, two_sided=True))
+
+
+def cup() -> mi.Scene:
+    """An open cup on a floor, under a sky and a lamp that its walls hide in part from the floor at their foot."""
     bulb = {"type": "sphere", "center": [1, 2, -1], "radius": 0.3, "emitter": light(9, 9, 8)}
     view = camera((0.5, 1.4, -2.6), (0.2, 0.2, 0), fov=24)
-    return scene(sensor=view, floor=floor(), cup=thing, bulb=bulb, sky=constant(0.3))
+    return scene(sensor=view, floor=floor(), cup=open_cup((0.2, 0, -0.2)), bulb=bulb, sky=constant(0.3))
 
 
 def stair() -> mi.Scene:

@@ -24,8 +24,7 @@ from rimlight.edge_sampling.parametrisation import in_plane, material_point
 from rimlight.edge_sampling.rays import spawn_ray, spawn_ray_to
 
 from .fallen_shadow import LightPoint, LitEdge, fall
-from .past_edges import look, turning
-from .shading_boundary import density_from_points
+from .past_edges import density_from_points, look, turning
 from .shadow_boundary import ShadowBoundary
 from .tracer import LightTracer, ShadingPoint
 

@@ -40,7 +40,7 @@ from .horizons_at_points import HorizonsAtPoints, turned
 from .indirect_shadows import is_bent, share
 from .lune import Lune, spreads
 from .near_lamps import share_at_first
-from .past_edges import look, turning
+from .past_edges import clear_of_overhangs, density_from_points, look, turning
 from .tracer import ShadingPoint, Tracer
 from .veiled_lamps import VeiledLamps
 from .veils import has_veils, is_veil
@@ -310,11 +310,16 @@ class ShadingBoundary:
             active &= (outward != 0) | near_or_crossed | (~emission & self.veils)
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
 
-            def see(side, active, slack=1):
+            def see(side, aside, active, slack=1):
                 return look(scene, si, x, p, outline, side * aside * across, slack * aside, distance, active)
 
             past, side = outward != 0, dr.select(outward != 0, outward, 1)
-            ray, pi, y, hidden, own = see(side, active)
+            seen = see(side, aside, active)
+            if tracer.scatters(2):
+                clear = dr.select(active & ~emission & seen[-1], clear_of_overhangs(scene, outline, seen[2], ω), 0)
+                farther, aside = clear > aside, dr.maximum(clear, aside)
+                seen = dr.select(farther, see(side, aside, active & farther), seen)
+            ray, pi, y, hidden, own = seen
             veiled = hidden & ~emission & is_veil(y) if self.veils else mi.Bool(False)
             active &= veiled | (~hidden & (past | (own & near_or_crossed)))
             # Past all edges behind a veil, and past lines that move over their surface, both sides slide.
@@ -330,8 +335,8 @@ class ShadingBoundary:
                 L += dr.select(reflected, scattered, 0)
             if tracer.scatters(2) or tracer.lamps is not None or self.crossed:
                 # Just inside of the outline of a ball, p is as far from the ball's tangent plane as the ray is aside.
-                seen = see(-side, active & (veiled | (near_or_crossed & ~outline.is_line)), slack=2)
-                other_L, of_faces = self._shown_by_faces(tracer, point, *seen, again, light, emission, lune, veiled)
+                other = see(-side, aside, active & (veiled | (near_or_crossed & ~outline.is_line)), slack=2)
+                other_L, of_faces = self._shown_by_faces(tracer, point, *other, again, light, emission, lune, veiled)
                 active &= of_faces | veiled | ~slide
                 # Of lines in which shapes cut each other, each is one of two that are looked at.
                 L = dr.select(slide, (L - other_L) * dr.select(outline.is_line, mi.Float(0.5), 1), L)
@@ -420,23 +425,6 @@ class ShadingBoundary:
             mine = lit & (emitter == mi.EmitterPtr(several))
             L = dr.select(mine, several.eval_background(y, mine), L)
         return L
-
-
-def density_from_points(
-    density: mi.Float, cos_z: mi.Float, cos_x: mi.Float, cos_y: mi.Float, r_x: mi.Float, r_y: mi.Float
-) -> mi.Float:
-    """Density with which y is found from points x, relative to that with which it is found as a vertex of a light
-    subpath: by area; but each way is left less of the edges that are close to where it starts, of which both choose too
-    few.
-
-    What slides over a surface that is seen edge-on moves as 1 / `cos_z`: more of it is found from points than the
-    densities alone would have it.
-
-    density : by area, with which x is found from the vertex before. cos_z : of the angle between the normal at x and
-    the direction to that. cos_x, cos_y : between the line past the edge and the normals. r_x, r_y : distances of the
-    edge.
-    """
-    return density / dr.square(cos_z) * cos_x / cos_y * dr.square(r_x / r_y)
 
 
 def _found_from_points(

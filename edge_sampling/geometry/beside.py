@@ -55,8 +55,12 @@ def clear_of_overhang(
     rays, met : on both sides of the line, and the surfaces.
     """
     n, m = (dr.mulsign(si.n, -dr.dot(si.n, ray.d)) for si, ray in zip(met, rays, strict=True))
-    flags = [si.bsdf().flags() for si in met]
-    either = lambda kind: mi.has_flag(flags[0], kind) | mi.has_flag(flags[1], kind)
+    return clear_of(scene, p, n, m, [si.bsdf().flags() for si in met])
+
+
+def clear_of(scene: mi.Scene, p: mi.Point3f, n: mi.Vector3f, m: mi.Vector3f, flags: Sequence[mi.UInt32]) -> mi.Float:
+    """`clear_of_overhang` of surfaces with the normals n and m, on the side of the viewer, and such BSDFs."""
+    either = lambda kind: reduce(operator.or_, (mi.has_flag(f, kind) for f in flags))
     ways_in = mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission, mi.BSDFFlags.DiffuseTransmission
     goes_in = reduce(operator.or_, map(either, ways_in))
     below = dr.maximum(overhang(n, m), dr.select(goes_in, overhang(n, -m), 0))

@@ -16,7 +16,7 @@ import touching_lamps
 from frozen import assert_frozen_is_unfrozen
 
 from rimlight.checks import Motion, derivative_image
-from rimlight.edge_sampling.boundaries import deep_shadows, shading_boundary
+from rimlight.edge_sampling.boundaries import deep_shadows, past_edges, shading_boundary
 from rimlight.transport.vertex_table import VertexTable
 
 RUNS = 6
@@ -120,7 +120,7 @@ def test_shadows_continued_from_the_light():
 def test_shadows_in_light_from_surfaces(monkeypatch):
     """Whatever is found from points, and what from surfaces: the sum has the same mean."""
     terms = "edges from points", "shadows in light from surfaces"
-    density, found = shading_boundary.density_from_points, []
+    density, found = past_edges.density_from_points, []
     for scale in (0.01, 1e4):
         for module in (shading_boundary, deep_shadows):
             monkeypatch.setattr(module, "density_from_points", lambda *a, scale=scale: scale * density(*a))
