@@ -612,6 +612,12 @@ MUTANTS = [
         "farther = mi.Bool(False)",
     ),
     mutant(
+        "shadows in light from surfaces: where nothing sends light, other terms lose their points, too",
+        "plugins/transport/bidirectional_tracer.py",
+        "active = active & (vertex.number > 0) & self.depths.scatters(depth + vertex.number)",
+        "active &= (vertex.number > 0) & self.depths.scatters(depth + vertex.number)",
+    ),
+    mutant(
         "shadows from lights: sides of boxes that stand flush throw shadows on each other",
         "edge_sampling/boundaries/fallen_shadow.py",
         "(at_foot | edge.outline.is_behind(hit.n, ω))",

@@ -35,7 +35,7 @@ class Boundaries:
     `indirect` : shadows, and borders of beams, in indirect light. `deep` : shadows in light from surfaces.
     `horizons` : where interpolated normals turn away from points. `held` : shapes whose points are held where the
     camera sees them. `lamp_planes` : of coarse lamps with interpolated normals. `mirrored` : may other points, too, see
-    edges in perfect mirrors, or through glass?"""
+    edges in perfect mirrors, or through glass? `brightens` : may what is black become brighter?"""
 
     film: FilmBoundary | None = None
     shadows: ShadowBoundary | None = None
@@ -59,6 +59,7 @@ class Boundaries:
     held: HeldShapes | None = None
     lamp_planes: LampPlanes | None = None
     mirrored: bool = False
+    brightens: bool = False
 
     @property
     def silhouettes(self) -> Silhouettes | None:

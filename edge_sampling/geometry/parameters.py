@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 
+#: What meshes know of their vertices besides colours and the like.
+OF_VERTICES = "vertex_positions", "vertex_normals", "vertex_texcoords"
+
 
 class Parameter(NamedTuple):
     """One parameter: its name (that of `mi.traverse`, but where two are alike), whose it is, and where its value is."""
@@ -19,6 +22,15 @@ class Parameter(NamedTuple):
     @property
     def value(self) -> Any:
         return self.place if self.kind is None else mi.get_property(self.place, self.kind, self.node)
+
+
+def may_brighten(parameter: Parameter) -> bool:
+    """May a surface become brighter that reflects nothing, as the parameter changes? Of materials, their textures, and
+    the colours of meshes."""
+    name = parameter.name.rpartition(".")[2]
+    if isinstance(parameter.node, mi.Shape):
+        return name.startswith(("vertex_", "face_")) and name not in OF_VERTICES
+    return isinstance(parameter.node, mi.BSDF | mi.Texture)
 
 
 def parameters(scene: mi.Scene) -> list[Parameter]:

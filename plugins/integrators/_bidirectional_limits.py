@@ -7,26 +7,24 @@ import mitsuba as mi
 
 from rimlight._plan import listed, names
 from rimlight.edge_sampling.boundaries.fine_mirrors import fringe
-from rimlight.edge_sampling.geometry.parameters import parameters
 from rimlight.edge_sampling.refusals import Refusal
 
+from ._black import BlackParameters
 from ._limits import Media, is_mirror
-
-#: Last words of the names of parameters to which light is proportional.
-COLOURS = ("reflectance", "radiance", "intensity", "irradiance", "specular_reflectance", "diffuse_reflectance")
 
 #: Cosines that differ from 1 by less are those of equal normals, up to rounding.
 SAME = 1e-6
 
 
 class BidirectionalLimits:
-    """What derivatives lack. Values of parameters are looked at once for each set of those that carry gradients."""
+    """What derivatives lack."""
 
     #: Nothing, for `dr.freeze`.
     DRJIT_STRUCT = dict.fromkeys(())
 
     def __init__(self) -> None:
-        self._known: dict[tuple[str, ...], list[str]] = {}
+        missing = "so is the derivative with respect to it, since no light takes these paths"
+        self._black = BlackParameters(missing, "prb_edge", emitters=True)
         self._lamps: dict[tuple[int, ...], list[str]] = {}
 
     def refuse(self, scene: mi.Scene, who: str) -> None:
@@ -60,18 +58,7 @@ class BidirectionalLimits:
                 f"{listed(names(delta))}, though the image has them; give the mirrors a roughness, or the light a "
                 "size."
             )
-        with dr.resume_grad():
-            changing = [p for p in parameters(scene) if dr.grad_enabled(p.value)]
-        colours = [p for p in changing if any(word in COLOURS for word in p.name.split("."))]
-        key = tuple(p.name for p in colours)
-        if key not in self._known and not dr.flag(dr.JitFlag.FreezingScope):
-            self._known[key] = [
-                f'where "{p.name}" is 0, so is the derivative with respect to it, since no light takes these paths; '
-                "start from a small positive number, or use prb_edge."
-                for p in colours
-                if dr.any(dr.ravel(dr.detach(p.value)) == 0)
-            ]
-        return limits + self._known.get(key, [])
+        return limits + self._black.of(scene)
 
 
 def bent(lamp: mi.Shape) -> bool:

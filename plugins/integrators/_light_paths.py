@@ -237,7 +237,7 @@ class LightPaths:
             y = onwards.pi.compute_surface_interaction(onwards.ray, mi.RayFlags.Minimal, active)
             light = scattering.number(y.emitter(self.scene))
         vertex = Vertex(place.ray, place.pi, place.number, place.throughput, η, mi.Bool(False), mi.Bool(False))
-        after, goes_on = step(vertex, onwards, sampler, self.depths, active)
+        after, goes_on, _ = step(vertex, onwards, sampler, self.depths, active)
         # What Russian roulette divides by belongs to the throughput.
         with dr.resume_grad(when=to.attached):
             now = place.throughput * dr.detach(onwards.weight)

@@ -47,7 +47,7 @@ from rimlight.edge_sampling.geometry.instances import Instances, is_flat
 from rimlight.edge_sampling.geometry.interpolated import normals_turn, texture_slides
 from rimlight.edge_sampling.geometry.mapped_horizons import MappedHorizon, mapped_horizons
 from rimlight.edge_sampling.geometry.meshes import inner, lets_rays_through, surfaces
-from rimlight.edge_sampling.geometry.parameters import Parameter, parameters
+from rimlight.edge_sampling.geometry.parameters import Parameter, may_brighten, parameters
 from rimlight.edge_sampling.geometry.surfaces import Surfaces
 from rimlight.edge_sampling.geometry.texture_edges import TextureEdges
 from rimlight.edge_sampling.geometry.texture_lines import looked_at_once
@@ -130,8 +130,9 @@ class BoundarySearch:
             changing = [p for p in found if dr.grad_enabled(p.value)]
             self._refuse_moving_others(geometry, changing)
             moving = self._what_moves(scene, sensor, geometry, changing)
+        brightens = any(may_brighten(p) for p in changing)
         if not moving.anything:
-            return Boundaries(limits=limits)
+            return Boundaries(limits=limits, brightens=brightens)
         if not dr.flag(dr.JitFlag.FreezingScope):
             self._find_lines(scene)
             self._looks.at(found)
@@ -151,7 +152,9 @@ class BoundarySearch:
         ):
             boundaries = replace(boundaries, slides=Slides.EVERYTHING)
         limits += (*boundaries.limits, *self._limits_of_sensor(sensor, moving))
-        return replace(boundaries, limits=limits) if limits != boundaries.limits else boundaries
+        if limits == boundaries.limits and not brightens:
+            return boundaries
+        return replace(boundaries, limits=limits, brightens=brightens)
 
     # ---------------------- Edges ----------------------
 

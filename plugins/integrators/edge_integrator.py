@@ -294,7 +294,7 @@ class EdgeIntegrator(ADIntegrator):
         rays = lambda sampler: self.sample_rays(scene, sensor, sampler)
         tracer = self.TRACER(scene, self)
         tracer.slides, tracer.lights, tracer.lamps = boundaries.slides, boundaries.lights, boundaries.lamps
-        tracer.fine_mirrors = boundaries.fine_mirrors
+        tracer.fine_mirrors, tracer.brightens = boundaries.fine_mirrors, boundaries.brightens
         tracer.moving = boundaries.shading.moving_shapes if boundaries.shading is not None else None
         if boundaries.held is not None:
             tracer.held = FirstPoints(boundaries.held, sensor)

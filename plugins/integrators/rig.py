@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -12,6 +14,7 @@ from rimlight.edge_sampling.refusals import InputError, Refusal
 from rimlight.terms.sampling import in_a_row, over_film, seed_of
 from rimlight.terms.term import Job
 
+from ._black import BlackParameters
 from ._finite import report_gradients, report_image
 from ._layers import Layers, LayerSamples
 from ._light_paths import LightPaths
@@ -137,6 +140,8 @@ class RigIntegrator(EdgeIntegrator):
             raise InputError(f"{who}: spectral variants are not supported, got {mi.variant()}")
         self.lights_per_path, self.min_depth = values["lights_per_path"], values["min_depth"]
         self.pixel_density: mi.Float | None = None
+        missing = "its derivative lacks the light that samples of the material find"
+        self.limits = BlackParameters(missing, "direct_edge or prb_edge", emitters=False)
 
     # ---------------------- Mitsuba's interface ----------------------
 
@@ -178,6 +183,10 @@ class RigIntegrator(EdgeIntegrator):
         report_gradients(self.name, params)
 
     # ---------------------- Derivative ----------------------
+
+    def _boundaries(self, scene, sensor, sppi, find=None):
+        boundaries = super()._boundaries(scene, sensor, sppi, find)
+        return replace(boundaries, limits=(*boundaries.limits, *self.limits.of(scene)))
 
     def _differentiate(self, scene, sensor, seed, spp, grad_in) -> Layers:
         """All terms, in forward mode, or given a gradient, in backward mode."""

@@ -156,7 +156,7 @@ class BidirectionalTracer(PathTracer):
     def sender(self, count: int, depth: mi.UInt32, active: mi.Bool) -> Sender:
         light = self._lights[2]
         vertex = dr.gather(LightVertex, light, dr.arange(mi.UInt32, count) % dr.width(light.number), active)
-        active &= (vertex.number > 0) & self.depths.scatters(depth + vertex.number)
+        active = active & (vertex.number > 0) & self.depths.scatters(depth + vertex.number)
         si = vertex.pi.compute_surface_interaction(vertex.ray, mi.RayFlags.All, active)
         through = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
         # Behind its plane, interpolated normals may send light, too.

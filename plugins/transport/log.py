@@ -57,8 +57,13 @@ class Log:
             value = value if isinstance(value, mi.UInt32) else dr.reinterpret_array(mi.UInt32, value)
             dr.scatter(target, value, row, active, mode=dr.ReduceMode.NoConflicts)
 
-    def leave(self, depth: mi.UInt32, β: mi.Spectrum, numbers: Numbers, active: mi.Bool) -> None:
-        """Note the throughput to a vertex, and its random numbers."""
+    def leave(
+        self, depth: mi.UInt32, β: mi.Spectrum, numbers: Numbers, active: mi.Bool, lit: mi.Spectrum | None = None
+    ) -> None:
+        """Note the throughput to a vertex, and its random numbers. lit : see `Vertex`."""
+        if lit is not None:
+            # The sign says whether something before it is black.
+            β = dr.select(β != 0, lit, -lit)
         row, active = self._row(depth), active & (depth <= self.last)
         dr.scatter(self._β, β, row, active, mode=dr.ReduceMode.NoConflicts)
         for name in ("light", "lobe", "direction"):
@@ -86,8 +91,10 @@ class Log:
             pi.instance = dr.reinterpret_array(mi.ShapePtr, whole("instance"))
         return Vertex(ray, pi, depth, mi.Spectrum(1), mi.Float(1), t < 0, (prim & 1) != 0)
 
-    def β(self, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        return dr.gather(mi.Spectrum, self._β, self._row(depth), active)
+    def throughput(self, depth: mi.UInt32, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """To a vertex: β, and `Vertex.lit`."""
+        noted = dr.gather(mi.Spectrum, self._β, self._row(depth), active)
+        return dr.maximum(noted, 0), dr.abs(noted)
 
     def numbers(self, depth: mi.UInt32, active: mi.Bool) -> Numbers:
         row = self._row(depth)

@@ -29,6 +29,8 @@ class Vertex:
     η : mi.Float, product of the relative indices of refraction up to it.
     mirrored : mi.Bool, is it what a perfect mirror or a smooth glass shows?
     slides : mi.Bool, does it slide over its surface, however far it is from the vertex before?
+    lit : mi.Spectrum, β as if the first surface along the path that is black were white, for a derivative in which it
+        may become brighter; None: β itself.
     """
 
     ray: mi.Ray3f
@@ -38,6 +40,7 @@ class Vertex:
     η: mi.Float
     mirrored: mi.Bool
     slides: mi.Bool
+    lit: mi.Spectrum | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def scattered_light(
         last = active & onwards.through & ~depths.scatters(vertex.depth + 1)
         stopped |= (active & ~onwards.through) | scattering.stops(onwards.ray, onwards.pi, sampler, last)
         first += dr.select(onwards.through & (vertex.depth == first), mi.UInt32(1), 0)
-        vertex, active = step(vertex, onwards, sampler, depths, active)
+        vertex, active, _ = step(vertex, onwards, sampler, depths, active)
         return L, stopped, vertex, first, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
@@ -174,7 +177,7 @@ def choose_vertices(
         longest = dr.select(onwards.mirrored, dr.minimum(since, before), since)
         before, since = since, dr.select(slides, longest, vertex.depth + 1)
         density = dr.select(onwards.mirrored, dr.inf, bs.pdf / r2)
-        vertex, active = step(vertex, onwards, sampler, depths, active)
+        vertex, active, _ = step(vertex, onwards, sampler, depths, active)
         return totals, kept, vertex, since, before, density, moved, active, sampler
 
     active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
@@ -195,13 +198,23 @@ def choose_vertices(
     return kept
 
 
-def step(vertex, onwards, sampler, depths, active):
-    """The next vertex, and whether the path goes on there. Paths end at random as in Mitsuba's `path`."""
-    β = vertex.β * dr.detach(onwards.weight)
-    η = vertex.η * onwards.η
-    depth = vertex.depth + 1
-    p = dr.minimum(dr.max(β) * dr.square(η), 0.95)
-    ends = (depth >= depths.rr_depth) & (sampler.next_1d(active) >= p)
-    β = dr.select(depth >= depths.rr_depth, β * dr.rcp(p), β)
-    active = active & onwards.pi.is_valid() & depths.scatters(depth) & dr.any(β != 0) & ~ends
-    return Vertex(mi.Ray3f(onwards.ray), onwards.pi, depth, β, η, onwards.mirrored, onwards.slides), active
+def step(
+    vertex: Vertex, onwards: Next, sampler: mi.Sampler, depths: Depths, active: mi.Bool
+) -> tuple[Vertex, mi.Bool, mi.Float]:
+    """The next vertex, whether the path goes on there, and by what its throughput is multiplied because others have
+    ended. Paths end at random as in Mitsuba's `path`."""
+    weight = dr.detach(onwards.weight)
+    β, η, depth = vertex.β * weight, vertex.η * onwards.η, vertex.depth + 1
+    lit = β if vertex.lit is None else as_if_lit(vertex, weight)
+    p = dr.minimum(dr.max(lit) * dr.square(η), 0.95)
+    may_end = depth >= depths.rr_depth
+    ends = may_end & (sampler.next_1d(active) >= p)
+    more = dr.select(may_end, dr.rcp(p), 1)
+    active = active & onwards.pi.is_valid() & depths.scatters(depth) & dr.any(lit != 0) & ~ends
+    there = mi.Ray3f(onwards.ray), onwards.pi, depth, β * more, η, onwards.mirrored, onwards.slides
+    return Vertex(*there, None if vertex.lit is None else lit * more), active, more
+
+
+def as_if_lit(vertex: Vertex, weight: mi.Spectrum) -> mi.Spectrum:
+    """`Vertex.lit` of the next vertex, before others end."""
+    return vertex.lit * dr.select(weight != 0, weight, dr.select(vertex.β != 0, mi.Spectrum(1), 0))

@@ -22,7 +22,7 @@ from rimlight.edge_sampling.parametrisation import Vicinity, look_from, sliding_
 from rimlight.edge_sampling.refusals import Refusal
 
 from .log import Log
-from .paths import Depths, Vertex, step
+from .paths import Depths, Vertex, as_if_lit, step
 from .scattering import Numbers, Scattering, next_vertex
 
 #: Longest path of which a table is made without counting its vertices before.
@@ -45,7 +45,7 @@ class Chain:
     """The vertices of paths behind the first, as they move.
 
     vicinity : in which they slide.
-    lights, lamps : see `Scattering`.
+    lights, lamps, brightens : see `Scattering`.
     held : what is held where the camera sees it.
     """
 
@@ -56,8 +56,10 @@ class Chain:
         lights: LightChoice | None = None,
         lamps: DividedLight | None = None,
         held: FirstPoints | None = None,
+        *,
+        brightens: bool = False,
     ):
-        self.scattering = Scattering(scene, attached=True, lights=lights, lamps=lamps)
+        self.scattering = Scattering(scene, attached=True, lights=lights, lamps=lamps, brightens=brightens)
         self.vicinity, self.held = vicinity, held
 
     def surface(self, vertex: Vertex, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -121,9 +123,11 @@ class Replay:
         active: mi.Bool,
         lights: LightChoice | None = None,
         lamps: DividedLight | None = None,
+        *,
+        brightens: bool = False,
     ):
         self.scene, self.sampler, self.vertex, self.start, self.depths = scene, sampler, vertex, start, depths
-        self.chain = Chain(scene, vicinity, lights, lamps)
+        self.chain = Chain(scene, vicinity, lights, lamps, brightens=brightens)
         self.active = active & vertex.pi.is_valid() & depths.scatters(vertex.depth)
 
     def forward(self, start: Start) -> mi.Spectrum:
@@ -143,13 +147,9 @@ class Replay:
                 moving = onwards.moving
                 δdirect, δweight, o, d = derivatives(direct, onwards.weight, moving.o, moving.d)
             total += dr.select(active, vertex.β * δdirect + β * dr.detach(direct), 0)
-            weight = dr.detach(onwards.weight)
-            β = β * weight + vertex.β * δweight
-            after, active = step(vertex, onwards, sampler, depths, active)
-            # What Russian roulette divides by.
-            now = dr.max(vertex.β * weight)
-            β *= dr.select(now > 0, dr.max(after.β) / now, 0)
-            return total, o, d, β, after, active, sampler
+            after, goes_on, more = step(vertex, onwards, sampler, depths, active)
+            β = more * (β * dr.detach(onwards.weight) + vertex.β * δweight)
+            return total, o, d, β, after, goes_on, sampler
 
         zero = dr.zeros(mi.Spectrum, dr.width(self.active))
         state = (zero, start.o, start.d, start.weight, self.vertex, self.active, self.sampler.clone())
@@ -160,39 +160,39 @@ class Replay:
         parameters; returns the gradient with respect to the start."""
         log, last = written(self.scene, self.vertex.ray, 2, self.depths, self._follow, lambda last: last)
         chain, scattering = self.chain, self.chain.scattering
-        first = dr.detach(self.start.weight)
 
-        def bounce(depth, L, δo, δd):
+        def bounce(depth, L, lit, δo, δd):
             active = self.active & (depth >= 2)
             vertex, beyond = log.vertex(depth, active), log.vertex(depth + 1, active)
             o, d = leaves(vertex.ray.o, vertex.ray.d)
             si = chain.surface(vertex, o, d, active)
-            numbers, β = log.numbers(depth, active), log.β(depth, active)
+            numbers = log.numbers(depth, active)
+            vertex.β, vertex.lit = log.throughput(depth, active)
             direct, onwards = scattering.scatter(
                 si, si.bsdf(vertex.ray), numbers, active, chain.vicinity, dr.detach(beyond.pi)
             )
             with dr.resume_grad():
-                # What comes from farther on, relative to its value.
-                weight, moving = onwards.weight, onwards.moving
-                now = dr.detach(weight)
-                rest = dr.select(now != 0, L * weight / dr.select(now != 0, now, 1), 0)
-                value = dr.sum(δL * (β * direct + rest)) + dr.dot(δo, moving.o) + dr.dot(δd, moving.d)
+                # What comes from farther on, and is more because other paths have ended.
+                now = dr.max(as_if_lit(vertex, dr.detach(onwards.weight)))
+                more = dr.select(now > 0, dr.max(lit) / dr.select(now > 0, now, 1), 0)
+                arriving, moving = direct + onwards.weight * (more * L), onwards.moving
+                value = dr.sum(δL * vertex.β * arriving) + dr.dot(δo, moving.o) + dr.dot(δd, moving.d)
                 dr.backward_from(dr.select(active, value, 0), flags=FLAGS)
                 δo, δd = dr.select(active, dr.grad(o), δo), dr.select(active, dr.grad(d), δd)
-            L += dr.select(active, β * dr.detach(direct), 0)
-            return depth - 1, L, δo, δd
+            L, lit = (dr.select(active, *pair) for pair in ((dr.detach(arriving), L), (vertex.lit, lit)))
+            return depth - 1, L, lit, δo, δd
 
         width = dr.width(self.active)
         zero = mi.Vector3f(dr.zeros(mi.Float, width))
-        _, L, δo, δd = dr.while_loop(
-            (last, dr.zeros(mi.Spectrum, width), zero, mi.Vector3f(zero)),
+        dark = dr.zeros(mi.Spectrum, width)
+        _, L, _, δo, δd = dr.while_loop(
+            (last, dark, mi.Spectrum(dark), zero, mi.Vector3f(zero)),
             lambda depth, *_: self.active & (depth >= 2),
             bounce,
             label="path replay",
         )
         # Of exactly these types: `dr.set_grad` passes over others, without a word.
-        weight = dr.select(first != 0, δL * L / dr.select(first != 0, first, 1), 0)
-        return Start(mi.Point3f(δo), mi.Vector3f(δd), mi.Spectrum(weight))
+        return Start(mi.Point3f(δo), mi.Vector3f(δd), mi.Spectrum(δL * L))
 
     def _follow(self, log: Log | None) -> mi.UInt32:
         """Write the paths down; returns the number of the last vertex of each that scatters, 0 if there is none."""
@@ -205,12 +205,13 @@ class Replay:
             numbers = scattering.draw(sampler, active)
             bsdf = si.bsdf(vertex.ray)
             there = scattering.directions_of(si, bsdf, active)
-            _, onwards = next_vertex(scene, si, bsdf, numbers, active, self.chain.vicinity, directions=there)
+            of_chain = {"directions": there, "brightens": scattering.brightens}
+            _, onwards = next_vertex(scene, si, bsdf, numbers, active, self.chain.vicinity, **of_chain)
             if log is not None:
-                log.leave(vertex.depth, vertex.β, numbers, active)
+                log.leave(vertex.depth, vertex.β, numbers, active, vertex.lit)
                 log.arrive(vertex.depth + 1, onwards, active)
             last = dr.select(active, vertex.depth, last)
-            vertex, active = step(vertex, onwards, sampler, self.depths, active)
+            vertex, active, _ = step(vertex, onwards, sampler, self.depths, active)
             return last, vertex, active, sampler
 
         state = (dr.zeros(mi.UInt32, dr.width(self.active)), self.vertex, self.active, self.sampler.clone())

@@ -67,6 +67,7 @@ class Scattering:
     attached : carry gradients? Otherwise values only.
     lights : chooses one of many lights; None: Mitsuba does.
     lamps : how their light is divided; None: it is held at points of the lamps.
+    brightens : may what is black become brighter? Then paths go on from there, if attached.
     """
 
     def __init__(
@@ -74,11 +75,12 @@ class Scattering:
         scene: mi.Scene,
         *,
         attached: bool,
+        brightens: bool = False,
         lights: LightChoice | None = None,
         lamps: DividedLight | None = None,
     ):
         self.scene, self.lights, self.lamps = scene, lights, lamps
-        self.attached = attached
+        self.attached, self.brightens = attached, attached and brightens
         flags = [e.flags() for e in scene.emitters()]
         self.any = bool(flags)
         self.any_delta = any(f & mi.EmitterFlags.Delta for f in flags)
@@ -262,9 +264,9 @@ class Scattering:
         """Emitted light that `si` reflects from a direction sampled from the BSDF: mi.Spectrum, (N,); and the next
         vertex. The arguments are those of `scatter`. chosen : the light of the light sample there."""
         scene, context = self.scene, mi.BSDFContext()
-        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, vicinity, met, directions)
+        bs, onwards = next_vertex(scene, si, bsdf, numbers, active, vicinity, met, directions, self.brightens)
         ray, pi, weight, mirrored = onwards.ray, onwards.pi, onwards.weight, onwards.mirrored
-        active = active & dr.any(weight != 0)
+        active = active & goes_on(bs, weight, self.brightens)
         if not self.attached:
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         else:
@@ -406,6 +408,7 @@ def next_vertex(
     vicinity: Vicinity | None = None,
     met: mi.PreliminaryIntersection3f | None = None,
     directions: Directions | MattDirections | None = None,
+    brightens: bool = False,
 ) -> tuple[mi.BSDFSample3f, Next]:
     """A direction sampled from the BSDF, and the vertex there. Detached.
 
@@ -413,6 +416,7 @@ def next_vertex(
     met : what the ray to it meets, if that is known.
     directions : where it is active, the direction is sampled from there. The BSDF has no perfect reflection, and lets
         nothing through.
+    brightens : see `Scattering`.
     """
     bs, weight = bsdf.sample(mi.BSDFContext(), si, numbers.lobe, numbers.direction, active)
     if directions is not None:
@@ -421,12 +425,18 @@ def next_vertex(
         there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & directions.active) / pdf
         weight = dr.select(directions.active, there, weight)
         bs.sampled_type = dr.select(directions.active, 0, bs.sampled_type)
-    active = active & dr.any(weight != 0)
+    active = active & goes_on(bs, weight, brightens)
     through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
     ray = spawn_ray(scene, si, si.to_world(bs.wo), through)
     pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met
     slides = mirrored if vicinity is None else mirrored | vicinity.is_infinite(bsdf)
     return bs, Next(ray, pi, weight, bs.eta, active & through, mirrored, slides)
+
+
+def goes_on(bs: mi.BSDFSample3f, weight: mi.Spectrum, brightens: bool) -> mi.Bool:
+    """Does light from the direction of a sample of a BSDF matter? brightens : see `Scattering`."""
+    matters = dr.any(weight != 0)
+    return matters | (bs.pdf > 0) if brightens else matters
 
 
 def divides_by_density(bsdf: mi.BSDF) -> bool:

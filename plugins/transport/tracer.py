@@ -56,6 +56,9 @@ class PathTracer:
     #: What is held where the camera sees it; None: nothing.
     held: FirstPoints | None = None
 
+    #: See `Scattering`.
+    brightens = False
+
     #: The shapes that move, where nothing else does; None: all are taken to do so.
     moving: Sequence[mi.ShapePtr] | None = None
 
@@ -114,7 +117,8 @@ class PathTracer:
         bsdf = si.bsdf(ray)
         backdrop = active & (scene.environment() is not None and not self.hide_emitters)
         active &= si.is_valid()
-        scattering = Scattering(scene, attached=attached, lights=self.lights, lamps=self.lamps)
+        chosen = {"lights": self.lights, "lamps": self.lamps, "brightens": self.brightens}
+        scattering = Scattering(scene, attached=attached, **chosen)
         if not self.scatters(1):
             return Radiance(L, backdrop | scattering.stops(ray, pi, sampler, active))
 
@@ -141,10 +145,11 @@ class PathTracer:
         two = dr.full(mi.UInt32, 2, dr.width(pi.t))
         second = Vertex(detached, onwards.pi, two, β, η, onwards.mirrored, onwards.slides)
         if attached:
+            if self.brightens:
+                second.lit = dr.select(active, dr.select(β != 0, β, 1), 0)
             with dr.resume_grad():
                 start = Start(onwards.moving.o, onwards.moving.d, mi.Spectrum(onwards.weight * stretch))
-            chosen = self.lights, self.lamps
-            return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, *chosen))
+            return Radiance(L, valid, Replay(scene, sampler, second, start, vicinity, self.depths, active, **chosen))
         options = {"lights": self.lights}
         if before is not None:
             beyond = {"before": before, "horizon": horizon, "directions": directions}

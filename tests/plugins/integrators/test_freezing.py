@@ -265,7 +265,7 @@ def test_all_that_is_read_is_known_to_frozen_functions():
         (shading, {"geometry", "cut_lamps", "crossed_lamps"}),
         (shading.from_edges, set()),
         (shading.silhouettes, {"geometry"}),
-        (shading.silhouettes.tree, {"geometry", "node_offsets", "leaf_offsets", "_recorded"}),
+        (shading.silhouettes.tree, {"geometry", "_recorded"}),
         (shading.silhouettes.curves, set()),
     ):
         assert vars(part).keys() - unread == type(part).DRJIT_STRUCT.keys(), type(part).__name__
