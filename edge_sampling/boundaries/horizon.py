@@ -11,8 +11,9 @@ of the triangle to a point of the side opposite, from a to b, meets the curve wh
 
     p(s, t) = c + t ((1 − s) (a − c) + s (b − c)),        s, t in [0, 1],   g(p(s, t)) = 0.
 
-If g has different signs at the corners, c is the one that is alone with its sign, and each line meets the curve once.
-If not, the curve may still enter and leave through one side: then c is the corner opposite, and s is between the two.
+If g has different signs at the corners, c is the one that is alone with its sign, and nearly every line meets the curve
+once. If not, seen from close by, the curve may still enter and leave through one side, to which c is opposite, or close
+within the triangle. Then lines meet it twice, once, or not at all.
 
 As vertices, normals and viewer move, t follows by one step of Newton's method, whose derivative is exact.
 
@@ -141,8 +142,8 @@ class Horizons:
     def chords(
         self, positions: mi.Float, normals: mi.Float, face: mi.UInt32, eye: mi.Point3f, far: bool, radius: mi.Float
     ) -> tuple[mi.Point3f, mi.Point3f, mi.Bool]:
-        """About where the curve is: where it enters and leaves the face; of faces without one, which may have one as
-        seen from another point of the lens, the longest side. Detached.
+        """About where the curve is: where it enters and leaves the face. The longest side, if it does not part the
+        corners, or if there is none, but may be one as seen from another point of the lens. Detached.
 
         eye : world space; or, if `far`, the direction towards the viewer. radius : of the lens around it.
 
@@ -155,15 +156,15 @@ class Horizons:
             near = mi.Bool(False)
             for q, normal in zip(p, n, strict=True):
                 near |= dr.abs(_towards(q, normal, eye, far)) <= dr.norm(normal) * radius
-            p, n, start, end, there = _arrange(p, n, eye, far)
+            p, n, mixed, there = _arrange(p, n, eye, far)
             ends = []
-            for s in (start, end):
+            for s in (mi.Float(0), mi.Float(1)):
                 D, N = dr.lerp(p[1] - p[0], p[2] - p[0], s), dr.lerp(n[1] - n[0], n[2] - n[0], s)
                 first, second = _roots(p[0], n[0], D, N, eye, far)
                 ends.append(p[0] + dr.clip(dr.select(_inside(first), first, second), 0, 1) * D)
             longest = dr.squared_norm(p[2] - p[0]) > dr.squared_norm(p[1] - p[0])
             sides = p[0], dr.select(longest, p[2], p[1])
-            return *(dr.select(there, c, side) for c, side in zip(ends, sides, strict=True)), there | near
+            return *(dr.select(mixed, c, side) for c, side in zip(ends, sides, strict=True)), there | near
 
     def point(
         self, positions: mi.Float, normals: mi.Float, face: mi.UInt32, u: mi.Float, eye: mi.Point3f, far: bool
@@ -172,9 +173,8 @@ class Horizons:
         p, n = self._face(positions, normals, face)
         with dr.suspend_grad():
             front = dr.normalize(dr.cross(p[1] - p[0], p[2] - p[0]))
-        p, n, start, end, valid = _arrange(p, n, dr.detach(eye), far)
-        s = dr.lerp(start, end, u)
-        D, N = dr.lerp(p[1] - p[0], p[2] - p[0], s), dr.lerp(n[1] - n[0], n[2] - n[0], s)
+        p, n, _, valid = _arrange(p, n, dr.detach(eye), far)
+        D, N = dr.lerp(p[1] - p[0], p[2] - p[0], u), dr.lerp(n[1] - n[0], n[2] - n[0], u)
         with dr.suspend_grad():
             first, second = _roots(p[0], n[0], D, N, eye, far)
             # If the line meets the curve twice, one of both, by what the choice of s has left of the random number.
@@ -188,7 +188,7 @@ class Horizons:
             g_t = dr.dot(N, view) - moves * dr.dot(normal, D)
             g_s = t * (dr.dot(n[2] - n[1], view) - moves * dr.dot(normal, p[2] - p[1]))
             tangent = t * mi.Vector3f(p[2] - p[1]) - (g_s / g_t) * mi.Vector3f(D)
-            tangent *= (end - start) * dr.select(both, mi.Float(2), 1)
+            tangent *= dr.select(both, mi.Float(2), 1)
             length2 = dr.squared_norm(tangent)
             valid &= (g_t != 0) & dr.isfinite(length2) & (length2 > 0)
             facing = mi.Vector3f(D) * dr.sign(g_t)
@@ -265,19 +265,20 @@ def _towards(p: mi.Point3f, n: mi.Vector3f, eye: mi.Point3f, far: bool) -> mi.Fl
     return dr.dot(n, mi.Vector3f(eye) if far else mi.Vector3f(eye - p))
 
 
-def _arrange(p: list, n: list, eye: mi.Point3f, far: bool) -> tuple[list, list, mi.Float, mi.Float, mi.Bool]:
-    """Corners and their normals, with the corner first from which the curve is looked for; the interval of s on the
-    side opposite; and is there a curve? All but the first two are detached."""
+def _arrange(p: list, n: list, eye: mi.Point3f, far: bool) -> tuple[list, list, mi.Bool, mi.Bool]:
+    """Corners and their normals, with the corner first from which the curve is looked for; does it part the corners;
+    and is there one at all? The last two are detached."""
     p, n = list(p), list(n)
     with dr.suspend_grad():
         front = [_towards(q, normal, eye, far) > 0 for q, normal in zip(p, n, strict=True)]
         mixed = (front[0] != front[1]) | (front[0] != front[2])
-        dips = [mi.Bool(False)] * 3
+        dips, closes = [mi.Bool(False)] * 3, mi.Bool(False)
         if not far:
             for k in range(3):
                 i, j = (k + 1) % 3, (k + 2) % 3
                 roots = _roots(p[i], n[i], p[j] - p[i], n[j] - n[i], eye, far)
                 dips[k] = ~mixed & _inside(roots[0]) & _inside(roots[1]) & (roots[0] != roots[1])
+            closes = ~mixed & _changes_within(p, n, eye)
         is_first = [
             (front[1] != front[0]) & (front[1] != front[2]) | (dips[1] & ~dips[0]),
             (front[2] != front[0]) & (front[2] != front[1]) | (dips[2] & ~dips[1] & ~dips[0]),
@@ -285,11 +286,20 @@ def _arrange(p: list, n: list, eye: mi.Point3f, far: bool) -> tuple[list, list, 
     for k, taken in zip((1, 2), is_first, strict=True):
         for values in (p, n):
             values[0], values[k] = dr.select(taken, values[k], values[0]), dr.select(taken, values[0], values[k])
-    with dr.suspend_grad():
-        roots = _roots(p[1], n[1], p[2] - p[1], n[2] - n[1], eye, far)
-        dip = dips[0] | dips[1] | dips[2]
-        start, end = dr.select(mixed, 0, dr.minimum(*roots)), dr.select(mixed, 1, dr.maximum(*roots))
-        return p, n, dr.detach(start), dr.detach(end), mixed | dip
+    return p, n, mixed, mixed | dips[0] | dips[1] | dips[2] | closes
+
+
+def _changes_within(p: list, n: list, eye: mi.Point3f) -> mi.Bool:
+    """Has g, of triangles at whose corners it has one sign, the other one at its extremum, and is that inside?"""
+    D, N, view = [q - p[0] for q in p[1:]], [m - n[0] for m in n[1:]], eye - p[0]
+    # g = g₀ + b·x − xᵀ A x, with barycentric coordinates x.
+    b = [dr.dot(m, view) - dr.dot(n[0], d) for m, d in zip(N, D, strict=True)]
+    first, last = dr.dot(N[0], D[0]), dr.dot(N[1], D[1])
+    mixed = 0.5 * (dr.dot(N[0], D[1]) + dr.dot(N[1], D[0]))
+    scale = 0.5 / (first * last - dr.square(mixed))
+    x, y = scale * (b[0] * last - b[1] * mixed), scale * (b[1] * first - b[0] * mixed)
+    g = dr.dot(n[0], view)
+    return (x > 0) & (y > 0) & (x + y < 1) & (g * (g + 0.5 * (b[0] * x + b[1] * y)) < 0)
 
 
 def _inside(t: mi.Float) -> mi.Bool:
