@@ -121,3 +121,33 @@ def test_archives_do_not_depend_on_the_disk(tmp_path):
     assert distribution.digest(archives[0]) == distribution.digest(archives[1])
     with tarfile.open(archives[0]) as archive:
         assert [(e.name, archive.extractfile(e).read()) for e in archive] == [("a", b"a"), ("b", b"b")]
+
+
+def test_arguments_are_not_changed_in_place(root):
+    """`active &= …` changes the array of the caller. (Bodies of loops may: what they are given is their own.)"""
+    changed = []
+    for file in (f for top in ("plugins", "edge_sampling") for f in (root / top).rglob("*.py")):
+        for function in functions(ast.parse(file.read_text("utf-8"))):
+            args = function.args
+            arguments = {a.arg for a in (*args.posonlyargs, *args.args, *args.kwonlyargs)}
+            for node in statements(function):
+                if isinstance(node, ast.Assign):
+                    arguments -= {n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)}
+                elif isinstance(node, ast.AugAssign) and getattr(node.target, "id", None) in arguments:
+                    changed.append(f"{file.relative_to(root)}:{node.lineno}: {ast.unparse(node)}")
+    assert not changed
+
+
+def functions(tree: ast.Module) -> list[ast.FunctionDef]:
+    """Those of a module and of its classes, but not those within functions."""
+    bodies = [tree.body, *(node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]
+    return [node for body in bodies for node in body if isinstance(node, ast.FunctionDef)]
+
+
+def statements(node: ast.AST) -> list[ast.AST]:
+    """Below a node in the order of the text, but for those of functions within."""
+    found = []
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.FunctionDef | ast.Lambda):
+            found += [child, *statements(child)]
+    return found

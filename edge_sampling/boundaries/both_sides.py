@@ -67,5 +67,5 @@ class Beside:
         surfaces = []
         for ray, pi in zip(rays, met, strict=True):
             surfaces.append(pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active))
-            active &= compare_depth(p, ray, surfaces[-1], rounding(p, ray.o))[0]
+            active = active & compare_depth(p, ray, surfaces[-1], rounding(p, ray.o))[0]
         return active, surfaces

@@ -59,7 +59,7 @@ def on_grids(
     n = dr.normalize(n_dl)
     across = lambda found: reach * dr.select(outline, dr.normalize(found.facing), n)
     w, there = _search(outlines, at, look, chosen, found, u, p, across(found), outline, active & of_grid)
-    active &= there | ~of_grid
+    active = active & (there | ~of_grid)
 
     # ---------------------- The tangent there ----------------------
 

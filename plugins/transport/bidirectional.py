@@ -149,7 +149,7 @@ class CameraPaths:
         """What the vertex reflects of what that of its light subpath sends there, weighted."""
         subpath = dr.arange(mi.UInt32, dr.width(number)) % dr.width(light.number)
         vertex = dr.gather(LightVertex, light, subpath, active)
-        active &= (vertex.number > 0) & self.depths.scatters(number + vertex.number)
+        active = active & (vertex.number > 0) & self.depths.scatters(number + vertex.number)
         active &= self.ways.counts(vertex.number + 1, number + 1)
         ray = vertex.ray
         y = vertex.pi.compute_surface_interaction(ray, mi.RayFlags.All, active)

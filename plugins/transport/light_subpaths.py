@@ -203,9 +203,9 @@ class LightSubpaths:
         refracts = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission) & (bs.eta != 1)
         at_mirror *= dr.select(refracts & dr.isfinite(turned), turned, 1)
         scattered = dr.select(mirrored, at_mirror, f / bs.pdf) * (cosine / before)
-        active &= (bs.pdf > 0) & (cosine > 0) & dr.any(at_mirror != 0)
+        active = active & (bs.pdf > 0) & (cosine > 0) & dr.any(at_mirror != 0)
         shorter = shorter.beyond(cosine, bs.pdf, back, mirrored)
-        β *= dr.select(active, scattered, 0)
+        β = β * dr.select(active, scattered, 0)
         # The end of a path by chance: of what the light has sent, how much is left?
         p = dr.minimum(dr.max(β) / start, 0.95)
         # The sensor is one more segment, as from a camera path that has this many vertices.
