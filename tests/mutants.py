@@ -607,7 +607,7 @@ MUTANTS = [
     ),
     mutant(
         "edges from points: what leans over its foot darkens what it stands on",
-        "edge_sampling/boundaries/shading_boundary.py",
+        "edge_sampling/boundaries/past_edges.py",
         "farther, aside = clear > aside, dr.maximum(clear, aside)",
         "farther = mi.Bool(False)",
     ),

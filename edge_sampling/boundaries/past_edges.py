@@ -26,6 +26,21 @@ def look(scene, si, x, p, outline, beside, aside, distance, active):
     return ray, pi, y, pi.is_valid() & hidden, pi.is_valid() & ~off
 
 
+def look_aside(scene, si, x, outline, across, distance, side, aside, active, slack=1):
+    """See `look`: from x beside `outline`, on a side of it, ±1 along `across`, as far aside as this. slack : how far
+    from the edge a surface may be on which it lies, in units of that."""
+    p = dr.detach(outline.p)
+    return look(scene, si, x, p, outline, side * aside * across, slack * aside, distance, active)
+
+
+def look_clear(scene, outline, ω, seen, aside, active, see):
+    """What is `seen` past an edge, from how far aside: farther where that is a surface on which the edge lies, and over
+    which it leans. ω : from the viewer. see : looks so far aside, where active."""
+    clear = dr.select(active & seen[-1], clear_of_overhangs(scene, outline, seen[2], ω), 0)
+    farther, aside = clear > aside, dr.maximum(clear, aside)
+    return dr.select(farther, see(aside, active & farther), seen), aside
+
+
 def turning(n_dl: mi.Vector3f, d: mi.Vector3f, valid: mi.Bool) -> mi.Float:
     """Zero, with the gradient of the direction of d, along `n_dl`."""
     ω = dr.normalize(dr.select(valid, d, mi.Vector3f(0, 0, 1)))

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +41,7 @@ from .horizons_at_points import HorizonsAtPoints, turned
 from .indirect_shadows import is_bent, share
 from .lune import Lune, spreads
 from .near_lamps import share_at_first
-from .past_edges import clear_of_overhangs, density_from_points, look, turning
+from .past_edges import density_from_points, look_aside, look_clear, turning
 from .tracer import ShadingPoint, Tracer
 from .veiled_lamps import VeiledLamps
 from .veils import has_veils, is_veil
@@ -309,16 +310,11 @@ class ShadingBoundary:
             near_or_crossed = (near > 0) | outline.crosses
             active &= (outward != 0) | near_or_crossed | (~emission & self.veils)
             aside = self.silhouettes.beside(scene, placement, sample, p, x)
-
-            def see(side, aside, active, slack=1):
-                return look(scene, si, x, p, outline, side * aside * across, slack * aside, distance, active)
-
+            see = partial(look_aside, scene, si, x, outline, across, distance)
             past, side = outward != 0, dr.select(outward != 0, outward, 1)
             seen = see(side, aside, active)
             if tracer.scatters(2):
-                clear = dr.select(active & ~emission & seen[-1], clear_of_overhangs(scene, outline, seen[2], ω), 0)
-                farther, aside = clear > aside, dr.maximum(clear, aside)
-                seen = dr.select(farther, see(side, aside, active & farther), seen)
+                seen, aside = look_clear(scene, outline, ω, seen, aside, active & ~emission, partial(see, side))
             ray, pi, y, hidden, own = seen
             veiled = hidden & ~emission & is_veil(y) if self.veils else mi.Bool(False)
             active &= veiled | (~hidden & (past | (own & near_or_crossed)))

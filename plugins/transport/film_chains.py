@@ -232,7 +232,7 @@ class Chains:
         goes_on &= mirrored & (mask | dr.any(weight != 0))
         next_ray = spawn_ray(scene, si, si.to_world(bs.wo), through)
         next_pi = scene.ray_intersect_preliminary(next_ray, active=goes_on)
-        onwards = Next(next_ray, next_pi, weight, bs.eta, goes_on & through, mirrored, mirrored)
+        onwards = Next(next_ray, next_pi, weight, bs.eta, goes_on, goes_on & through, mirrored, mirrored)
         reflected = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)
         wrong = (dr.dot(ray.d, si.n) * dr.dot(next_ray.d, si.n) > 0) == reflected
         lobe = dr.select(reflected, mi.UInt32(2), 3) + dr.select(wrong, mi.UInt32(4), 0)

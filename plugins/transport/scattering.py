@@ -26,6 +26,7 @@ class Next:
     ray, pi : the ray to it, and what that meets. Detached.
     weight : throughput, mi.Spectrum; attached where wanted.
     η : relative index of refraction along the ray.
+    matters : mi.Bool, does light from there matter?
     through : mi.Bool, does the ray go on as if nothing was there?
     mirrored : mi.Bool, is its direction that of a perfect mirror, or of a smooth glass?
     slides : mi.Bool, is its direction held, however far it is?
@@ -36,6 +37,7 @@ class Next:
     pi: mi.PreliminaryIntersection3f
     weight: mi.Spectrum
     η: mi.Float
+    matters: mi.Bool
     through: mi.Bool
     mirrored: mi.Bool
     slides: mi.Bool
@@ -266,7 +268,7 @@ class Scattering:
         scene, context = self.scene, mi.BSDFContext()
         bs, onwards = next_vertex(scene, si, bsdf, numbers, active, vicinity, met, directions, self.brightens)
         ray, pi, weight, mirrored = onwards.ray, onwards.pi, onwards.weight, onwards.mirrored
-        active = active & goes_on(bs, weight, self.brightens)
+        active = active & onwards.matters
         if not self.attached:
             y = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         else:
@@ -425,18 +427,13 @@ def next_vertex(
         there = bsdf.eval(mi.BSDFContext(), si, bs.wo, active & directions.active) / pdf
         weight = dr.select(directions.active, there, weight)
         bs.sampled_type = dr.select(directions.active, 0, bs.sampled_type)
-    active = active & goes_on(bs, weight, brightens)
+    matters = dr.any(weight != 0) | (brightens & (bs.pdf > 0))
+    active = active & matters
     through, mirrored = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Null, mi.BSDFFlags.Delta))
     ray = spawn_ray(scene, si, si.to_world(bs.wo), through)
     pi = scene.ray_intersect_preliminary(ray, active=active) if met is None else met
     slides = mirrored if vicinity is None else mirrored | vicinity.is_infinite(bsdf)
-    return bs, Next(ray, pi, weight, bs.eta, active & through, mirrored, slides)
-
-
-def goes_on(bs: mi.BSDFSample3f, weight: mi.Spectrum, brightens: bool) -> mi.Bool:
-    """Does light from the direction of a sample of a BSDF matter? brightens : see `Scattering`."""
-    matters = dr.any(weight != 0)
-    return matters | (bs.pdf > 0) if brightens else matters
+    return bs, Next(ray, pi, weight, bs.eta, matters, active & through, mirrored, slides)
 
 
 def divides_by_density(bsdf: mi.BSDF) -> bool:

@@ -60,7 +60,7 @@ class Way:
         return True
 
 
-@pytest.mark.parametrize(("term", "functions", "files"), [("interior.py", 52, 13), ("film.py", 97, 21)])
+@pytest.mark.parametrize(("term", "functions", "files"), [("interior.py", 52, 13), ("film.py", 98, 21)])
 def test_is_short(root, term, functions, files):
     scene, integrator = cases.shadow_blocker()(), mi.load_dict({"type": "direct_edge"})
     params = mi.traverse(scene)
