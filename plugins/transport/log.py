@@ -12,7 +12,7 @@ from .scattering import Next, Numbers
 
 
 class Log:
-    """A table of the vertices of paths: for each sample and each number along the path, at most 84 bytes.
+    """A table of the vertices of paths: for each sample and each number along the path, at most 96 bytes.
 
     like : mi.Ray3f, of the time and the wavelengths of the paths.
     first, last : numbers of the vertices that it has room for.
@@ -38,6 +38,8 @@ class Log:
         whole = ("prim", "shape", *(("shape_index", "instance") if instances else ()))
         self._whole = {name: dr.empty(mi.UInt32, n) for name in whole}
         self._β = dr.empty(mi.Float, n * dr.size_v(mi.Spectrum))
+        #: `Vertex.lit`, where it is noted.
+        self._lit: mi.Float | None = None
 
     def _row(self, depth: mi.UInt32) -> mi.UInt32:
         return (depth - self.first) * self.width + dr.arange(mi.UInt32, self.width)
@@ -57,21 +59,24 @@ class Log:
             value = value if isinstance(value, mi.UInt32) else dr.reinterpret_array(mi.UInt32, value)
             dr.scatter(target, value, row, active, mode=dr.ReduceMode.NoConflicts)
 
+    def make_room_for_lit(self) -> None:
+        """To be called before the first vertex, if `Vertex.lit` is to be noted."""
+        self._lit = dr.empty(mi.Float, dr.width(self._β))
+
     def leave(
         self, depth: mi.UInt32, β: mi.Spectrum, numbers: Numbers, active: mi.Bool, lit: mi.Spectrum | None = None
     ) -> None:
         """Note the throughput to a vertex, and its random numbers. lit : see `Vertex`."""
-        if lit is not None:
-            # The sign says whether something before it is black.
-            β = dr.select(β != 0, lit, -lit)
         row, active = self._row(depth), active & (depth <= self.last)
         dr.scatter(self._β, β, row, active, mode=dr.ReduceMode.NoConflicts)
+        if self._lit is not None:
+            dr.scatter(self._lit, lit, row, active, mode=dr.ReduceMode.NoConflicts)
         for name in ("light", "lobe", "direction"):
             dr.scatter(self._floats[name], getattr(numbers, name), row, active, mode=dr.ReduceMode.NoConflicts)
 
     def close(self) -> None:
         """All is written."""
-        dr.eval(self._floats, self._whole, self._β)
+        dr.eval(self._floats, self._whole, self._β, self._lit)
 
     def vertex(self, depth: mi.UInt32, active: mi.Bool) -> Vertex:
         """What was noted on arrival. Its β is 1."""
@@ -93,8 +98,8 @@ class Log:
 
     def throughput(self, depth: mi.UInt32, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
         """To a vertex: β, and `Vertex.lit`."""
-        noted = dr.gather(mi.Spectrum, self._β, self._row(depth), active)
-        return dr.maximum(noted, 0), dr.abs(noted)
+        β, lit = self._β, self._β if self._lit is None else self._lit
+        return tuple(dr.gather(mi.Spectrum, source, self._row(depth), active) for source in (β, lit))
 
     def numbers(self, depth: mi.UInt32, active: mi.Bool) -> Numbers:
         row = self._row(depth)

@@ -173,8 +173,9 @@ class Replay:
             )
             with dr.resume_grad():
                 # What comes from farther on, and is more because other paths have ended.
-                now = dr.max(as_if_lit(vertex, dr.detach(onwards.weight)))
-                more = dr.select(now > 0, dr.max(lit) / dr.select(now > 0, now, 1), 0)
+                # (Throughputs are negative where a fit has made a reflectance so.)
+                now = dr.sum(dr.abs(as_if_lit(vertex, dr.detach(onwards.weight))))
+                more = dr.select(now > 0, dr.sum(dr.abs(lit)) / dr.select(now > 0, now, 1), 0)
                 arriving, moving = direct + onwards.weight * (more * L), onwards.moving
                 value = dr.sum(δL * vertex.β * arriving) + dr.dot(δo, moving.o) + dr.dot(δd, moving.d)
                 dr.backward_from(dr.select(active, value, 0), flags=FLAGS)
@@ -198,6 +199,8 @@ class Replay:
         """Write the paths down; returns the number of the last vertex of each that scatters, 0 if there is none."""
         scattering, scene = self.chain.scattering, self.scene
         if log is not None:
+            if self.vertex.lit is not None:
+                log.make_room_for_lit()
             log.arrive(self.vertex.depth, self.vertex, self.active)
 
         def bounce(last, vertex, active, sampler):
